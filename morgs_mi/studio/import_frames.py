@@ -18,7 +18,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -92,8 +91,18 @@ def import_frames(
     check_number("import_frames()", "fps", fps, "[1e-6, 1e6]")
     config = config or CodecConfig()
     paths = find_frames(sources)
-    path = _new_stream(out)
-    cameras = _rig_around(paths, axes, most_invalid)
+    path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / STREAM
+    if path.exists():
+        raise FileExistsError(
+            f"{path}: expected a new stream, got a file that exists; remove it, or name another."
+        )
+    in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
+    try:
+        cameras = default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
+    except ValueError as error:
+        if any(str(error).startswith(f"{path}: ") for path in paths):
+            raise
+        raise ValueError(f"{paths[0].parent}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     frames = (read_splats(source, most_invalid) for source in paths)
@@ -109,32 +118,6 @@ def import_frames(
                 writer.write(packet)
             report(done, len(paths))
     return Imported(path, len(paths), keyframes, path.stat().st_size)
-
-
-def _new_stream(out: str | Path) -> Path:
-    """Return the path of the stream, a file that does not exist yet."""
-    path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / STREAM
-    if path.exists():
-        raise FileExistsError(
-            f"{path}: expected a new stream, got a file that exists; remove it, or name another."
-        )
-    return path
-
-
-def _rig_around(paths: Sequence[Path], axes: Axes, most_invalid: float) -> tuple[Camera, ...]:
-    """Return the ring of cameras that sees the Gaussians of several frames."""
-    try:
-        return default_rig([read_splats(path, most_invalid) for path in _in_view(paths)], axes)
-    except ValueError as error:
-        if any(str(error).startswith(f"{path}: ") for path in paths):
-            raise
-        raise ValueError(f"{paths[0].parent}: {error}") from None
-
-
-def _in_view(paths: Sequence[Path]) -> list[Path]:
-    """Return the files of the frames that the ring sees."""
-    frames = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
-    return [paths[t] for t in frames]
 
 
 def _packets_of_frames(
@@ -155,22 +138,12 @@ def _packets_of_frames(
             state = decode(state, packet)
             yield [packet]
             continue
-        rows, order = _in_state(rows, order)
+        # Rows in the state, -1 for births, and the new order there, in which births are last.
+        rows = np.where(rows < 0, -1, np.argsort(order)[rows])
+        order = np.argsort(np.where(rows < 0, len(order), rows), kind="stable")
         packet = residual_packet(state, gaussians.select(order), rows[order], cameras, config)
         state = decode(state, packet)
         yield [packet, *due_keyframe(state, config.keyframe_interval)]
-
-
-def _in_state(rows: np.ndarray, old_order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of Gaussians in the state, -1 for births, and their new order there, in which
-    births are last.
-
-    Args:
-        rows: rows in the frame before [M].
-        old_order: order of the frame before [N].
-    """
-    rows = np.where(rows < 0, -1, np.argsort(old_order)[rows])
-    return rows, np.argsort(np.where(rows < 0, len(old_order), rows), kind="stable")
 
 
 def find_frames(sources: Sequence[str | Path]) -> list[Path]:
@@ -185,64 +158,40 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         ValueError: there are no such files, or they have several formats.
     """
     paths = [Path(source) for source in sources]
-    _check_exist(paths)
-    if len(paths) == 1 and paths[0].is_dir():
-        paths = _frames_in(paths[0])
-    if not paths:
-        raise ValueError(
-            "import_frames(): `sources` must be a folder or at least one file, got none."
-        )
-    _check_formats(paths)
-    return paths
-
-
-def _check_exist(paths: Sequence[Path]) -> None:
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(
                 f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
             )
-
-
-def _frames_in(folder: Path) -> list[Path]:
-    """Return the files with Gaussians in a folder, at least one, by the numbers in their names."""
-    files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
-    paths = sorted(files, key=lambda path: natural_key(path.name))
+    if len(paths) == 1 and paths[0].is_dir():
+        folder = paths[0]
+        files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
+        paths = sorted(files, key=lambda path: natural_key(path.name))
+        if not paths:
+            for file in listed(folder):
+                refuse_foreign(file)
+            raise ValueError(
+                f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
+                "convert the frames."
+            )
     if not paths:
-        _refuse_folder(folder)
-    return paths
-
-
-def _refuse_folder(folder: Path) -> NoReturn:
-    """Raise `ValueError` for a folder without frames."""
-    for file in listed(folder):
-        refuse_foreign(file)
-    raise ValueError(
-        f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
-        "convert the frames."
-    )
-
-
-def _check_formats(paths: Sequence[Path]) -> None:
-    """Raise `ValueError` unless all files have one format, of those that are read."""
+        raise ValueError(
+            "import_frames(): `sources` must be a folder or at least one file, got none."
+        )
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
-        _refuse(first[None])
+        refuse_foreign(first[None])
+        raise ValueError(
+            f"{first[None]}: expected one folder, or files whose names end in "
+            f"{', '.join(SUFFIXES)}, got another; convert it, or leave it out."
+        )
     if len(first) > 1:
         names = " and ".join(path.name for path in first.values())
         raise ValueError(
             f"{paths[0].parent}: expected frames of one format, got {names}; name the files of "
             "one of them."
         )
-
-
-def _refuse(path: Path) -> NoReturn:
-    """Raise `ValueError` for a file of another format."""
-    refuse_foreign(path)
-    raise ValueError(
-        f"{path}: expected one folder, or files whose names end in "
-        f"{', '.join(SUFFIXES)}, got another; convert it, or leave it out."
-    )
+    return paths
 
 
 def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
@@ -252,12 +201,9 @@ def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
     old, new = _scaled_features(before, now)
-    mask = _squared_norms(new - old) <= _squared_norms(new - np.roll(old, -1, axis=0))
-    return bool(np.mean(mask) >= _LEAST_SHARE)
-
-
-def _squared_norms(rows: np.ndarray) -> np.ndarray:
-    return np.square(rows).sum(axis=1)
+    distances = np.square(new - old).sum(axis=1)
+    distances_to_next = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
+    return bool(np.mean(distances <= distances_to_next) >= _LEAST_SHARE)
 
 
 def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
@@ -276,25 +222,16 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     fewer = min(len(before), len(now))
     if before.sh_degree != now.sh_degree or not fewer:
         return None
-    nearest = _nearest_rows(before, now)
-    if nearest is None:
+    old, new = _scaled_features(before, now)
+    if not old.shape[1] or not np.isfinite(new).all():  # they cannot be compared
         return None
+    # The search takes forever among many that are equal.
+    distinct, first = np.unique(old, axis=0, return_index=True)
+    nearest = first[KDTree(distinct).query(new)[1]]
     survivors = _increasing(nearest)
     if len(survivors) < _LEAST_SURVIVORS * fewer:
         return None
     return _rows_with_gaps(survivors, nearest[survivors], len(now), len(before))
-
-
-def _nearest_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
-    """Return the most similar row of the frame before for each Gaussian; None where their features
-    cannot be compared.
-    """
-    old, new = _scaled_features(before, now)
-    if not old.shape[1] or not np.isfinite(new).all():
-        return None
-    # The search takes forever among many that are equal.
-    distinct, first = np.unique(old, axis=0, return_index=True)
-    return first[KDTree(distinct).query(new)[1]]
 
 
 def _rows_with_gaps(
@@ -339,14 +276,9 @@ def _increasing(numbers: np.ndarray) -> np.ndarray:
         previous[index] = lasts[length - 1] if length else -1
         ends[length : length + 1] = [number]
         lasts[length : length + 1] = [index]
-    return _chain(previous, lasts[-1] if lasts else -1, len(lasts))
-
-
-def _chain(previous: np.ndarray, last: int, length: int) -> np.ndarray:
-    """Return the `length` indices that end with `last`, each after its `previous` one."""
-    indices = np.empty(length, np.int64)
-    index = last
-    for place in reversed(range(length)):
+    indices = np.empty(len(lasts), np.int64)
+    index = lasts[-1] if lasts else -1
+    for place in reversed(range(len(lasts))):
         indices[place] = index
         index = previous[index]
     return indices
