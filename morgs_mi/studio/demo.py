@@ -5,7 +5,7 @@ and draw images.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
-from morgs_mi.evaluate.results import Evaluation, FrameScores
+from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
@@ -141,13 +141,21 @@ def _run(root: Path, config: DemoConfig, report_stage: Report | None) -> DemoRep
         for name, folder in (("full", "stream"), ("plain", "stream_plain"))
     }
     run_step("Drawing", lambda report: _draw(root, load_capture(capture), report))
-    frames, comparison = _compare(results)
+    # The frames that both fits have, without the first, which has no motion.
+    count = min(result.num_frames for result in results.values())
+    comparison = {}
+    for name, result in results.items():
+        scores = [asdict(frame.scores) for frame in result.frames[1:count]]
+        comparison[name] = {
+            score: float(np.mean([row[score] for row in scores])) if scores else None
+            for score in _COMPARED
+        }
     seconds["total"] = sum(seconds.values())
     report = DemoReport(
         config,
         results["full"],
         results["plain"],
-        frames,
+        [row.frame for row in results["full"].frames[1:count]],
         comparison,
         seconds,
         machine(),
@@ -184,15 +192,19 @@ def _fit_plain(root: Path, config: DemoConfig, progress: Progress) -> None:
     capture = load_capture(
         root / "capture", max_frames=min(config.plain_frames, config.clip.frames)
     )
-    plain = _without_motion(config.stream)
-    _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
-    _fit(capture, root / "stream_plain", plain, progress, resume=True)
-
-
-def _without_motion(config: StreamConfig) -> StreamConfig:
-    """Return the settings of a fit without motion, offset and confidence."""
     switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
-    return replace(config, motion=replace(config.motion, **switches))
+    plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
+    # The first frame has no motion, so the settings of the motion change nothing.
+    source = root / "stream"
+    out = root / "stream_plain"
+    stream = open_stream(source)
+    metadata = stream_metadata(capture, next(capture.partial_frames()), plain)
+    fitted_capture = as_fitted(capture, stream)
+    metadata |= about_lenses(fitted_capture)
+    out.mkdir(exist_ok=True)
+    with Recording(FitFiles.of(out), fitted_capture, metadata) as recording:
+        recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
+    _fit(capture, out, plain, progress, resume=True)
 
 
 def _synthesize_clip(
@@ -202,57 +214,12 @@ def _synthesize_clip(
     complete.
     """
     clip = replace(config.clip, seed=config.stream.seed)
-    if _clip_settings(config.scene, clip).items() <= stored_settings(folder).items():
+    settings = {"scene": config.scene, **clip.as_dict()}
+    given_settings = {name: value for name, value in settings.items() if value is not None}
+    if given_settings.items() <= stored_settings(folder).items():
         report(1, 1)
         return
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
-
-
-def _clip_settings(scene: str, clip: SynthConfig) -> dict[str, Any]:
-    """Return the scene of a clip and its settings that are not left open."""
-    settings = {"scene": scene, **clip.as_dict()}
-    return {name: value for name, value in settings.items() if value is not None}
-
-
-def _begin_with_first_frame(
-    out: Path, source: Path, capture: Capture, config: StreamConfig
-) -> None:
-    """Begin a fit with the first frame of another fit: it has no motion, so the settings of the
-    motion change nothing.
-
-    Args:
-        out: folder of the fit, which `stream_capture` resumes.
-        source: folder of the other fit.
-        capture: what is fitted.
-        config: settings of the fit.
-    """
-    stream = open_stream(source)
-    metadata = stream_metadata(capture, next(capture.partial_frames()), config)
-    capture = as_fitted(capture, stream)
-    metadata |= about_lenses(capture)
-    out.mkdir(exist_ok=True)
-    with Recording(FitFiles.of(out), capture, metadata) as recording:
-        recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
-
-
-def _compare(
-    results: Mapping[str, Evaluation],
-) -> tuple[list[int], dict[str, dict[str, float | None]]]:
-    """Return the frames that both fits have, without the first, which has no motion, and mean
-    scores over them.
-    """
-    count = min(result.num_frames for result in results.values())
-    rows = {name: result.frames[1:count] for name, result in results.items()}
-    means = {
-        name: {score: _mean_score(frames, score) for score in _COMPARED}
-        for name, frames in rows.items()
-    }
-    return [row.frame for row in rows["full"]], means
-
-
-def _mean_score(frames: Sequence[FrameScores], score: str) -> float | None:
-    values = [getattr(frame.scores, score) for frame in frames]
-    return float(np.mean(values)) if values else None
 
 
 def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -> None:
@@ -265,24 +232,15 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
     write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
     report(1, 2)
-    write_png(out / "contact_sheet.png", contact_sheet(_sheet(full, plain, scale)))
-    report(2, 2)
-
-
-def _sheet(
-    full: Sequence[Mapping[str, np.ndarray]],
-    plain: Sequence[Mapping[str, np.ndarray]],
-    scale: float,
-) -> list[list[np.ndarray]]:
-    """Return the rows of the contact sheet: three frames of the one fit, and one of the other."""
+    # The contact sheet has three frames of the one fit, and one of the other, which does not learn
+    # the confidence.
     last = len(plain) - 1
     frames = sorted({min(1, len(full) - 1), last, len(full) - 1})
-    # The plain fit does not learn the confidence.
     plain_panels = [panel for name, panel in plain[last].items() if name != "confidence"]
-    return [
-        *(list(full[frame].values()) for frame in frames),
-        [*plain_panels, motion_legend(scale)],
-    ]
+    sheet = [list(full[frame].values()) for frame in frames]
+    sheet.append([*plain_panels, motion_legend(scale)])
+    write_png(out / "contact_sheet.png", contact_sheet(sheet))
+    report(2, 2)
 
 
 def _panels(
@@ -298,11 +256,19 @@ def _panels(
     for frame, (index, images) in zip(
         capture.frames(), render_stream(reader, camera), strict=False
     ):
-        panels = _compared_images(frame.images[view], images["color"])
+        picture = channel_image("color", images["color"])
+        error = np.abs(picture.astype(float) - frame.images[view]) * _ERROR_GAIN / 255
+        panels = {
+            "truth": frame.images[view],
+            "render": picture,
+            "error": channel_image("color", error),
+        }
         truth = truth_for_camera(capture, camera, index)
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
-        panels |= _maps(images, scale)
+        for name in ("motion", "confidence"):
+            if name in images:
+                panels[name] = channel_image(name, images[name], scale)
         labels = {
             "truth": f"truth, frame {index}",
             "error": f"error x{_ERROR_GAIN}",
@@ -312,16 +278,3 @@ def _panels(
             {name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()}
         )
     return frames
-
-
-def _maps(images: Mapping[str, np.ndarray], scale: float) -> dict[str, np.ndarray]:
-    """Return the rendered motion and confidence as images, as far as there are any."""
-    names = [name for name in ("motion", "confidence") if name in images]
-    return {name: channel_image(name, images[name], scale) for name in names}
-
-
-def _compared_images(truth: np.ndarray, color: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the recorded image, the rendered one and their difference."""
-    picture = channel_image("color", color)
-    error = np.abs(picture.astype(float) - truth) * _ERROR_GAIN / 255
-    return {"truth": truth, "render": picture, "error": channel_image("color", error)}

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import islice, product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.ranges import AtLeast, check_value
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.results import Evaluation, known_mean
+from morgs_mi.evaluate.results import known_mean
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.stream_loop import StreamLoop
@@ -62,7 +62,8 @@ def sweep(
         ValueError: a number is below 1, or as `stream_capture`.
         OSError: as `stream_capture`.
     """
-    _check_numbers(epochs, seeds)
+    for name, value in (("seeds", seeds), *(("epochs", value) for value in epochs)):
+        check_value("sweep()", name, value, Annotated[int, AtLeast(1)])
     config = config or StreamConfig()
     _compile_kernels(capture, config)
     rows: list[Scores] = []
@@ -71,23 +72,21 @@ def sweep(
     for count, seed in ladder:
         stage(len(rows), len(ladder))
         settings = replace(config, fit=replace(config.fit, epochs=count), seed=seed)
-        rows.append(_fitted_scores(capture, Path(out) / f"epochs{count}-seed{seed}", settings))
+        folder = Path(out) / f"epochs{count}-seed{seed}"
+        stream_capture(capture, folder, settings)
+        result = evaluate_stream(folder, capture.path)
+        values = {
+            **asdict(result.scores),
+            "first_seconds": result.seconds.first,
+            "later_seconds": result.seconds.per_later_frame,
+            "bytes_per_frame": result.sizes.per_frame,
+        }
+        scores = {name: values[name] for name in SCORES}
+        rows.append({"epochs": count, "seed": seed, **scores})
         results = {"rows": rows, "machine": machine(), "versions": versions()}
         write_json(Path(out) / "sweep.json", results)
     stage(len(rows), len(ladder))
     return rows
-
-
-def _check_numbers(epochs: Sequence[int], seeds: int) -> None:
-    for name, value in (("seeds", seeds), *(("epochs", value) for value in epochs)):
-        check_value("sweep()", name, value, Annotated[int, AtLeast(1)])
-
-
-def _fitted_scores(capture: Capture, folder: Path, config: StreamConfig) -> Scores:
-    """Fit a capture into a folder, and return the row of the fit."""
-    stream_capture(capture, folder, config)
-    scores = _scores(evaluate_stream(folder, capture.path))
-    return {"epochs": config.fit.epochs, "seed": config.seed, **scores}
 
 
 def _compile_kernels(capture: Capture, config: StreamConfig) -> None:
@@ -96,13 +95,6 @@ def _compile_kernels(capture: Capture, config: StreamConfig) -> None:
     loop = StreamLoop.of(capture, replace(config, fit=fit))
     for frame in islice(capture.partial_frames(), _WARM_FRAMES):
         loop.push([frame.images[view] for view in capture.train_views])
-
-
-def _scores(result: Evaluation) -> Scores:
-    seconds = result.seconds
-    times = {"first_seconds": seconds.first, "later_seconds": seconds.per_later_frame}
-    values = {**asdict(result.scores), **times, "bytes_per_frame": result.sizes.per_frame}
-    return {name: values[name] for name in SCORES}
 
 
 def mean_scores(rows: Sequence[Scores]) -> list[Scores]:
@@ -132,20 +124,15 @@ def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
     panels = [name for name in [*SCORES][2:] if np.isfinite(means[0][name])]
     figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
     for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        _draw_score(axes, name, rows, means)
+        axes.plot([row["later_seconds"] for row in means], [row[name] for row in means])
+        axes.plot(
+            [row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4
+        )
+        for row in means:
+            place = (row["later_seconds"], row[name])
+            axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
+        axes.set(xlabel="seconds of a later frame", ylabel=SCORES[name][0])
+        axes.grid(color="0.9")
     with atomic_path(path, "write_sweep_plot()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(partial, format=path.suffix[1:].lower())
-
-
-def _draw_score(axes: Any, name: str, rows: Sequence[Scores], means: Sequence[Scores]) -> None:
-    """Draw one score of the fits and its means."""
-    axes.plot([row["later_seconds"] for row in means], [row[name] for row in means])
-    axes.plot(
-        [row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4
-    )
-    for row in means:
-        place = (row["later_seconds"], row[name])
-        axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
-    axes.set(xlabel="seconds of a later frame", ylabel=SCORES[name][0])
-    axes.grid(color="0.9")
