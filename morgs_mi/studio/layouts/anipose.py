@@ -39,27 +39,26 @@ _KEYS = ("matrix", "distortions", "rotation", "translation")
 _CAMERA = {*_KEYS, "name", "size", "fisheye"}
 # Entries of caliscope, FreeMoCap and Pose2Sim that say nothing about the lenses and poses.
 _HARMLESS = {
-    *(
-        "cam_id",
-        "port",
-        "error",
-        "exposure",
-        "grid_count",
-        "ignore",
-        "rotation_count",
-        "verified_resolutions",
-    ),
-    *(
-        "metadata",
-        "capture_volume",
-        "charuco",
-        "aruco",
-        "board",
-        "point_estimates",
-        "camera_count",
-        "creation_date",
-    ),
-    *("save_tracked_points_video", "fps_recording", "fps_sync_stream_processing", "version"),
+    "cam_id",
+    "port",
+    "error",
+    "exposure",
+    "grid_count",
+    "ignore",
+    "rotation_count",
+    "verified_resolutions",
+    "metadata",
+    "capture_volume",
+    "charuco",
+    "aruco",
+    "board",
+    "point_estimates",
+    "camera_count",
+    "creation_date",
+    "save_tracked_points_video",
+    "fps_recording",
+    "fps_sync_stream_processing",
+    "version",
 }
 # Pose2Sim names a camera after the folder of its checkerboard images, int_cam01_img.
 _FOLDER = re.compile(r"^int_(.+)_img$")
@@ -88,15 +87,8 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
             f"{path}: expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, "
             "found none; export the calibration again."
         )
-    others = {
-        key
-        for table in (content, tables)
-        for key in table
-        if key not in entries and key != "cameras"
-    }
-    warn_unread(
-        path, {*others, *(key for entry in entries.values() for key in entry)} - _CAMERA - _HARMLESS
-    )
+    keys = (content.keys() | tables.keys()) - entries.keys() - {"cameras"}
+    warn_unread(path, keys.union(*entries.values()) - _CAMERA - _HARMLESS)
     pairs = [_camera(path, key, entry) for key, entry in entries.items()]
     return [camera for camera, _ in pairs], [lens for _, lens in pairs]
 
@@ -121,10 +113,14 @@ def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Len
     viewmat = rigid(where, np.column_stack([rotation, _array(where, entry, "translation", (3,))]))
     try:
         clip = _FOLDER.sub(r"\1", str(name))
-        return Camera(K, viewmat, int(width), int(height), clip), _lens(where, entry)
+        camera = Camera(K, viewmat, int(width), int(height), clip)
     except ValueError as error:
-        message = str(error)
-        raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
+        raise ValueError(f"{where}: {error}") from None
+    if entry.get("fisheye", False):
+        distortions = _array(where, entry, "distortions", (4,)).tolist()
+        return camera, Lens("OPENCV_FISHEYE", tuple(distortions))
+    distortions = _array(where, entry, "distortions", (4,), (5,), (8,)).tolist()
+    return camera, opencv_lens(distortions)
 
 
 def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -143,24 +139,18 @@ def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, .
     return value
 
 
-def _lens(where: str, entry: Mapping[str, Any]) -> Lens:
-    fisheye = entry.get("fisheye", False)
-    lengths = (4,) if fisheye else (4, 5, 8)
-    values = _array(where, entry, "distortions", *((n,) for n in lengths)).tolist()
-    return Lens("OPENCV_FISHEYE", tuple(values)) if fisheye else opencv_lens(values)
-
-
 def _calibration_files(path: Path) -> list[Path]:
     """Return the calibrations of a capture, in it or in its folder `calibration`."""
-    return [file for file in calibration_files(path, "*.toml") if _is_calibration(file)]
-
-
-def _is_calibration(file: Path) -> bool:
-    try:
-        content = read_text(file, MAX_TOML)
-    except (OSError, ValueError):  # not readable, a folder or a pipe, or more than a calibration
-        return False
-    return all(mark.search(content) for mark in _MARKS)
+    files = []
+    for file in calibration_files(path, "*.toml"):
+        try:
+            content = read_text(file, MAX_TOML)
+        except (OSError, ValueError):
+            # Not readable, a folder or a pipe, or more than a calibration.
+            continue
+        if all(mark.search(content) for mark in _MARKS):
+            files.append(file)
+    return files
 
 
 def _read_calibration(path: Path) -> Calibration:

@@ -54,15 +54,6 @@ def read_meta(path: Path) -> list[MetaCamera]:
             "again."
         )
     warn_unread(path, meta.keys() - set(_KEYS))
-    _check_counts(path, meta)
-    columns = [
-        {str(camera_id): column for column, camera_id in enumerate(row)} for row in meta["cam_id"]
-    ]
-    names = sorted(map(str, meta["cam_id"][0]), key=natural_key)
-    return [_camera(path, meta, name, [row[name] for row in columns]) for name in names]
-
-
-def _check_counts(path: Path, meta: dict[str, Any]) -> None:
     rows = {key: meta[key] for key in ("fn", "cam_id", "k", "w2c")}
     if not all(
         isinstance(row, list) and row and all(isinstance(e, list) for e in row)
@@ -73,11 +64,9 @@ def _check_counts(path: Path, meta: dict[str, Any]) -> None:
             "again."
         )
     counts = {key: [len(entry) for entry in row] for key, row in rows.items()}
-    if (
-        any(count != counts["fn"] for count in counts.values())
-        or len(set(counts["fn"])) > 1
-        or not counts["fn"][0]
-    ):
+    count = counts["fn"][0]
+    expected = [count] * len(counts["fn"])
+    if not count or any(entries != expected for entries in counts.values()):
         table = ", ".join(
             f"{key} {len(c)} frames of {min(c)} to {max(c)} cameras" for key, c in counts.items()
         )
@@ -85,15 +74,17 @@ def _check_counts(path: Path, meta: dict[str, Any]) -> None:
             f"{path}: expected as many cameras in every frame and list, got {table}; export it "
             "again."
         )
-    ids = [sorted(map(str, row)) for row in meta["cam_id"]]
-    frame = next(
-        (t for t, row in enumerate(ids) if row != ids[0] or len(set(row)) < len(row)), None
-    )
-    if frame is not None:
-        raise ValueError(
-            f"{path}: frame {frame}: `cam_id` must name each camera of frame 0 once, got "
-            f"{meta['cam_id'][frame]}; export it again."
-        )
+    columns = [
+        {str(camera_id): column for column, camera_id in enumerate(row)} for row in meta["cam_id"]
+    ]
+    for frame, row in enumerate(columns):
+        if row.keys() != columns[0].keys() or len(row) < count:
+            raise ValueError(
+                f"{path}: frame {frame}: `cam_id` must name each camera of frame 0 once, got "
+                f"{meta['cam_id'][frame]}; export it again."
+            )
+    names = sorted(columns[0], key=natural_key)
+    return [_camera(path, meta, name, [row[name] for row in columns]) for name in names]
 
 
 def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int]) -> MetaCamera:
@@ -130,11 +121,11 @@ def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int])
         raise ValueError(
             f"{path}: `w` and `h` must be positive whole numbers, got {sizes}; export it again."
         )
+    viewmat = rigid(where, w2c[0])
     try:
-        camera = Camera(K[0], rigid(where, w2c[0]), *sizes, name=name)
+        camera = Camera(K[0], viewmat, *sizes, name=name)
     except ValueError as error:
-        message = str(error)
-        raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
+        raise ValueError(f"{where}: {error}") from None
     files = [row[c] for row, c in zip(meta["fn"], columns, strict=True)]
     return MetaCamera(camera, tuple(path.parent / "ims" / str(file) for file in files))
 

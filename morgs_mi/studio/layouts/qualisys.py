@@ -16,7 +16,6 @@ Positions are converted to metres.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -52,15 +51,20 @@ _READ = {
     "fov_video": {"left", "top", "right", "bottom"},
     "transform": {*"xyz", *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))},
     "intrinsic": {
-        *("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "focallength"),
-        *(
-            "radialDistortion1",
-            "radialDistortion2",
-            "radialDistortion3",
-            "tangentalDistortion1",
-            "tangentalDistortion2",
-        ),
-        *("sensorMinU", "sensorMaxU", "sensorMinV", "sensorMaxV"),
+        "focalLengthU",
+        "focalLengthV",
+        "centerPointU",
+        "centerPointV",
+        "focallength",
+        "radialDistortion1",
+        "radialDistortion2",
+        "radialDistortion3",
+        "tangentalDistortion1",
+        "tangentalDistortion2",
+        "sensorMinU",
+        "sensorMaxU",
+        "sensorMinV",
+        "sensorMaxV",
     },
 }
 _HARMLESS = {"fov_marker", "fov_marker_max", "fov_video_max"}
@@ -101,25 +105,22 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
         _LOG.warning(
             "%s: QTM displays %s rotated (viewrotation); their clips must show the images as the "
             "sensor recorded them.",
-            *(path, ", ".join(serials)),
+            path,
+            ", ".join(serials),
         )
-    warn_unread(path, (name for element in active for name in _unread(element)))
+    unread: set[str] = set()
+    for element in (element for camera in active for element in camera):
+        if element.tag in _READ:
+            others = set(element.keys()) - _READ[element.tag]
+            # A `skew` of 0 changes nothing.
+            if not element.get("skew", "").strip("0."):
+                others.discard("skew")
+            unread |= others
+        elif element.tag not in _HARMLESS:
+            unread.add(element.tag)
+    warn_unread(path, unread)
     pairs = [_camera(path, element) for element in active]
     return [camera for camera, _ in pairs], [lens for _, lens in pairs]
-
-
-def _unread(camera: Element) -> Iterator[str]:
-    """Yield the elements of a camera and their attributes that are not read; a `skew` of 0 changes
-    nothing.
-    """
-    for element in camera:
-        if element.tag in _HARMLESS:
-            continue
-        if element.tag not in _READ:
-            yield element.tag
-            continue
-        others = set(element.keys()) - _READ[element.tag]
-        yield from (name for name in others if name != "skew" or element.get(name, "").strip("0."))
 
 
 class _Plain(ElementTree.TreeBuilder):
