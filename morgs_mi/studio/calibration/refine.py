@@ -188,7 +188,8 @@ def refine_cameras(
         ValueError: fewer than two training views have an image of the first frame.
     """
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
-    bundle_changes, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
+    deviations = prior_deviations(problem.extent, config.camera_priors)
+    bundle_changes, tracks, deviations = _matched(capture, problem.indices, deviations)
     # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
     # compared.
     estimates = [0 * bundle_changes] * problem.has_rival + [bundle_changes] * bool(tracks)
@@ -249,11 +250,6 @@ class _Problem:
         """Whether the refined cameras are compared with the calibrated ones."""
         return self.config.refine_cameras == "auto"
 
-    @property
-    def deviations(self) -> np.ndarray:
-        """Standard deviations [11] of the priors."""
-        return prior_deviations(self.extent, self.config.camera_priors)
-
     def refined(
         self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]
     ) -> np.ndarray:
@@ -279,19 +275,15 @@ class _Problem:
         return changes
 
     def scores(self, estimates: Sequence[np.ndarray], report: Callable[[int], None]) -> list[float]:
-        """Return the score of each of several changes; `report` is called with the number of
-        completed fits.
+        """Return the PSNR of the withheld pixels, dB, after fits with cameras by each of several
+        changes; `report` is called with the number of completed fits.
         """
         scores = []
         for done, changes in enumerate(estimates, self.config.short_fits.rounds):
             report(done)
-            scores.append(self.score(changes))
+            views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
+            scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
         return scores
-
-    def score(self, changes: np.ndarray) -> float:
-        """Return the PSNR of the withheld pixels after a fit with changed cameras, dB."""
-        withheld_views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
-        return mean_psnr(self._fitted(self._begun(changes)), withheld_views, self.render)
 
     def sizes(self, changes: np.ndarray) -> tuple[float, float, float, float]:
         """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel
@@ -358,42 +350,27 @@ def register_camera(
     render = render or RenderConfig()
     priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
     deviations = prior_deviations(extent, priors)
-    changes = np.zeros((1, CHANGES))
-    for blur in (*_BLURS, 0.0):
-        changes = _registration(gaussians, view, changes, deviations, blur, render)
-    return changed_camera(view.camera, changes[0])
-
-
-def _registration(
-    gaussians: Gaussians,
-    view: View,
-    changes: np.ndarray,
-    deviations: np.ndarray,
-    blur: float,
-    render: RenderConfig,
-) -> np.ndarray:
-    """Return the changes [1, 11] of a camera, from initial ones, with which a blurred image fits
-    best.
-    """
     target = view.target
     means = np.asarray(gaussians.means, np.float64)
-    best = changes
-    error = np.inf
-    for _ in range(_REGISTRATION_STEPS):
-        camera = changed_camera(view.camera, changes[0])
-        G, b, new_error = _shifts(gaussians, camera, target, blur, render)
-        if not new_error < error:
-            break
-        best = changes
-        error = new_error
-        of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
-        equations = NormalEquations(1, 0)
-        equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
-        step, _ = equations.step(changes, deviations, 0.0)
-        changes = changes + step
-        if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
-            break
-    return best
+    best = np.zeros((1, CHANGES))
+    for blur in (*_BLURS, 0.0):
+        changes = best
+        error = np.inf
+        for _ in range(_REGISTRATION_STEPS):
+            camera = changed_camera(view.camera, changes[0])
+            G, b, new_error = _shifts(gaussians, camera, target, blur, render)
+            if not new_error < error:
+                break
+            best = changes
+            error = new_error
+            of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
+            equations = NormalEquations(1, 0)
+            equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
+            step, _ = equations.step(changes, deviations, 0.0)
+            changes = changes + step
+            if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
+                break
+    return changed_camera(view.camera, best[0])
 
 
 def _matched(
