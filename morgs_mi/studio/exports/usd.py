@@ -31,7 +31,6 @@ renderer rotates the harmonics with a prim. The unit of a capture is unknown; `m
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -95,14 +94,19 @@ def write_usd(
     path = Path(path)
     choose_format(USD, path)
     pxr = _pxr()
-    with atomic_path(path, "write_usd()") as partial, _system_errors(pxr):
-        if path.suffix.lower() != ".usdz":
-            _write_stage(pxr, stream, partial, frames, half, progress)
-            return
-        with TemporaryDirectory() as folder:
-            content = Path(folder) / f"{path.stem}.usdc"
-            _write_stage(pxr, stream, content, frames, half, progress)
-            pxr.UsdUtils.CreateNewUsdzPackage(str(content), str(partial))
+    with atomic_path(path, "write_usd()") as partial:
+        try:
+            if path.suffix.lower() != ".usdz":
+                _write_stage(pxr, stream, partial, frames, half, progress)
+                return
+            with TemporaryDirectory() as folder:
+                content = Path(folder) / f"{path.stem}.usdc"
+                _write_stage(pxr, stream, content, frames, half, progress)
+                pxr.UsdUtils.CreateNewUsdzPackage(str(content), str(partial))
+        except pxr.Tf.ErrorException as error:
+            # Errors of OpenUSD are file system errors here. The first one has the reason, the
+            # others follow from it.
+            raise OSError(getattr(error.args[0], "commentary", str(error))) from error
 
 
 def _write_stage(
@@ -305,16 +309,6 @@ def _fields(
             visibility().Set("invisible", end)
         fields[first_id] = _Field(pxr, prim, gaussians, half)
     return fields
-
-
-@contextmanager
-def _system_errors(pxr: Any) -> Iterator[None]:
-    """Raise errors of OpenUSD, which are file system errors here, as `OSError`."""
-    try:
-        yield
-    except pxr.Tf.ErrorException as error:
-        # The first one has the reason, the others follow from it.
-        raise OSError(getattr(error.args[0], "commentary", str(error))) from error
 
 
 def _pxr() -> Any:
