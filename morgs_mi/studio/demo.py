@@ -118,64 +118,54 @@ def run_demo(
             exists and is not a synthetic capture.
     """
     root = check_output(Path(out))
-    with locked_folder(root, "run_demo()"):
-        return _run(root, config or DemoConfig(), progress)
-
-
-def _run(root: Path, config: DemoConfig, report_stage: Report | None) -> DemoReport:
-    """Run the demonstration in a locked folder."""
+    config = config or DemoConfig()
     seconds: dict[str, float] = {}
-    run_step = partial(_timed, seconds, report_stage)
-    capture = root / "capture"
-    run_step("Path-tracing the clip", partial(_synthesize_clip, capture, config))
-    run_step(
-        "Fitting",
-        lambda progress: _fit(load_capture(capture), root / "stream", config.stream, progress),
-    )
-    run_step("Fitting without ML, MO, MC", partial(_fit_plain, root, config))
-    results = {
-        name: run_step(
-            f"Evaluating {folder}",
-            lambda progress, folder=folder: evaluate_stream(root / folder, progress=progress),
+
+    def run_step(name: str, work: Callable[[Progress], Any]) -> Any:
+        """Return the result of a step's work, and store its time."""
+        start = time.perf_counter()
+        result = work(Progress(progress, name))
+        seconds[name] = time.perf_counter() - start
+        return result
+
+    with locked_folder(root, "run_demo()"):
+        capture = root / "capture"
+        run_step("Path-tracing the clip", partial(_synthesize_clip, capture, config))
+        run_step(
+            "Fitting",
+            lambda progress: _fit(load_capture(capture), root / "stream", config.stream, progress),
         )
-        for name, folder in (("full", "stream"), ("plain", "stream_plain"))
-    }
-    run_step("Drawing", lambda report: _draw(root, load_capture(capture), report))
-    # The frames that both fits have, without the first, which has no motion.
-    count = min(result.num_frames for result in results.values())
-    comparison = {}
-    for name, result in results.items():
-        scores = [asdict(frame.scores) for frame in result.frames[1:count]]
-        comparison[name] = {
-            score: float(np.mean([row[score] for row in scores])) if scores else None
-            for score in _COMPARED
+        run_step("Fitting without ML, MO, MC", partial(_fit_plain, root, config))
+        results = {
+            name: run_step(
+                f"Evaluating {folder}",
+                lambda progress, folder=folder: evaluate_stream(root / folder, progress=progress),
+            )
+            for name, folder in (("full", "stream"), ("plain", "stream_plain"))
         }
-    seconds["total"] = sum(seconds.values())
-    report = DemoReport(
-        config,
-        results["full"],
-        results["plain"],
-        [row.frame for row in results["full"].frames[1:count]],
-        comparison,
-        seconds,
-        machine(),
-        versions(),
-    )
-    write_json(root / REPORT, report.as_dict())
-    return report
-
-
-def _timed(
-    seconds: dict[str, float],
-    report_stage: Report | None,
-    name: str,
-    work: Callable[[Progress], Any],
-) -> Any:
-    """Return the result of a step's work, and store its time in `seconds`."""
-    start = time.perf_counter()
-    result = work(Progress(report_stage, name))
-    seconds[name] = time.perf_counter() - start
-    return result
+        run_step("Drawing", lambda report: _draw(root, load_capture(capture), report))
+        # The frames that both fits have, without the first, which has no motion.
+        count = min(result.num_frames for result in results.values())
+        comparison = {}
+        for name, result in results.items():
+            scores = [asdict(frame.scores) for frame in result.frames[1:count]]
+            comparison[name] = {
+                score: float(np.mean([row[score] for row in scores])) if scores else None
+                for score in _COMPARED
+            }
+        seconds["total"] = sum(seconds.values())
+        report = DemoReport(
+            config,
+            results["full"],
+            results["plain"],
+            [row.frame for row in results["full"].frames[1:count]],
+            comparison,
+            seconds,
+            machine(),
+            versions(),
+        )
+        write_json(root / REPORT, report.as_dict())
+        return report
 
 
 def _fit(

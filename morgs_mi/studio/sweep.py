@@ -99,14 +99,11 @@ def _compile_kernels(capture: Capture, config: StreamConfig) -> None:
 
 def mean_scores(rows: Sequence[Scores]) -> list[Scores]:
     """Return the means over the seeds, for each number of epochs."""
-    same = {
-        epochs: [row for row in rows if row["epochs"] == epochs]
-        for epochs in {row["epochs"]: 0 for row in rows}
-    }
-    return [
-        {name: known_mean([row[name] for row in group]) for name in group[0]}
-        for group in same.values()
-    ]
+    means = []
+    for epochs in dict.fromkeys(row["epochs"] for row in rows):
+        group = [row for row in rows if row["epochs"] == epochs]
+        means.append({name: known_mean([row[name] for row in group]) for name in group[0]})
+    return means
 
 
 def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
