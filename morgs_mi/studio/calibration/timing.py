@@ -156,8 +156,8 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
         solution = equations.solution()
         change = solution - previous
         share = _share(step[train], change[train]) if blur in _BLUR_OF_ROUND[:index] else 1.0
-        longest_step = np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP)
-        result = np.clip(offsets + longest_step, -largest, largest)
+        move = np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP)
+        result = np.clip(offsets + move, -largest, largest)
         step = result - offsets
         offsets = result
         if not blur and np.abs(step).max() < _TOLERANCE:
