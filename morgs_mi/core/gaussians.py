@@ -175,7 +175,9 @@ class Gaussians:
                 "row for each."
             )
         N = len(self)
-        for attribute in BY_ACTIVATED_NAME.values():
+        for attribute in ATTRIBUTES:
+            if attribute.activated_name == "sh_coeffs":
+                continue  # two rows in one tensor, checked below
             value = getattr(self, attribute.name)
             if value is not None and tuple(value.shape) != (N, *attribute.shape):
                 expected = ", ".join(["N", *map(str, attribute.shape)])
