@@ -134,7 +134,7 @@ POSES_BOUNDS = {
         "cam00.mkv: expected a video, got an empty file",
         "--gaps",
     ),
-    "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .* no frame can be decoded"),
+    "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .*no frame can be decoded"),
 }
 BY_FRAME = {
     "pipe": (pipe("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
