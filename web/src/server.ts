@@ -26,7 +26,10 @@ export class Server {
       this.forget(); // the file was truncated
       return null;
     }
-    if (!response.ok) throw new Error(await response.text());
+    if (!response.ok) {
+      this.forget(); // another file was in its place
+      throw new Error(await response.text());
+    }
     const bytes = new Uint8Array(await response.arrayBuffer());
     const whole = response.status === 200;
     this.length = whole ? bytes.length : this.length + bytes.length - 1;
