@@ -53,7 +53,7 @@ from morgs_mi.method.ssim import Target
 
 _LOG = logging.getLogger(__name__)
 # Growth of the resident memory after which releasing it pays; it takes some milliseconds.
-_GROWTH = 1.05
+_GROWTH = 1.25
 
 
 @dataclass(frozen=True, eq=False)
