@@ -188,7 +188,9 @@ class VideoReader:
                 frames = (frame for packet in packets for frame in _unbroken(packet.decode))
                 numbered = enumerate(frames)
                 if stamps is not None:
-                    numbered = ((int(np.searchsorted(stamps, f.pts or 0)), f) for f in frames)
+                    # A frame of a damaged packet is none of those that the file holds.
+                    indices = {int(stamp): index for index, stamp in enumerate(stamps)}
+                    numbered = ((indices[f.pts], f) for f in frames if f.pts in indices)
                 head = next(numbered, None)
                 if head is not None and (head[0] <= first or not begin):
                     yield head
