@@ -131,8 +131,8 @@ def _opaque_in_file(file: Path) -> np.ndarray | None:
         header = stream.read(26)
     if header.startswith(b"\x76\x2f\x31\x01"):
         return opaque_light(file)
-    # JPEG has no alpha channel, and that of BMP files is not a mask. PNG has one with a palette,
-    # grey and alpha, or RGB and alpha.
+    # JPEG has no alpha channel, and the one of BMP is no mask. PNG may have one if its colour type
+    # is 3 (palette), 4 (grey and alpha) or 6 (RGB and alpha).
     is_png = header.startswith(b"\x89PNG")
     if header.startswith((b"\xff\xd8", b"BM")) or (
         is_png and header[25:] not in (b"\3", b"\4", b"\6")

@@ -21,8 +21,8 @@ _MAGIC = 20000630
 _MULTIPART = 1 << 12
 # Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
 _REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
-# Largest difference of chromaticities, pixel aspects and alpha that counts as equal; that of half
-# floats at 1 is 5e-4.
+# Chromaticities, pixel aspects and alphas that differ by less count as equal; a half float near 1
+# is rounded by up to 5e-4.
 _SAME = 1e-3
 # Attributes of a header, of which files have tens: a larger number takes seconds.
 _MOST_ATTRIBUTES = 1000
@@ -66,9 +66,9 @@ def read_light(path: str | Path) -> np.ndarray:
     """Return the image of an EXR file [H, W, 3], float32 in linear light with Rec. 709 primaries,
     not negative.
 
-    Its channels are R, G, B, those of its only layer with such channels, or Y alone. Other
-    primaries, which the attribute `chromaticities` names, are converted by colour-science, with
-    Bradford's adaptation to another white.
+    The file has the channels R, G, B, a single layer with these, or Y alone. Other primaries, which
+    the attribute `chromaticities` names, are converted by colour-science, with Bradford's
+    adaptation to another white.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -89,8 +89,10 @@ def read_light(path: str | Path) -> np.ndarray:
 
 
 def opaque_light(path: str | Path) -> np.ndarray:
-    """Return the mask [H, W] of the pixels of `read_light` that are stored and opaque; its errors
-    are those of `read_light`.
+    """Return the mask [H, W] of the pixels that are stored and opaque, bool.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: as for `read_light`.
     """
     channels, header = _read(path)
     left_top, right_bottom = header["dataWindow"]

@@ -76,7 +76,7 @@ def in_order(cameras: Sequence[Camera], images: Any, frame: int) -> list[InputIm
     """Return the images of a frame in the cameras' order.
 
     Raises:
-        ValueError: their number is not that of the cameras, or a name is not that of one camera.
+        ValueError: there is not one image for each camera, or a name is not that of exactly one.
     """
     names = [camera.name for camera in cameras]
     if isinstance(images, Mapping) and all(names.count(name) == 1 for name in images):

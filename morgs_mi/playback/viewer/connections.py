@@ -1,7 +1,7 @@
 """Connections of the viewer: limits of their number, and of their time without progress.
 
-uvicorn has neither. Unfinished requests, and answers that nobody reads, would stay open until the
-process can open no file any more.
+uvicorn limits neither: unfinished requests, and responses that the client does not read, would keep
+their sockets until the process has no file descriptor left.
 """
 
 from __future__ import annotations

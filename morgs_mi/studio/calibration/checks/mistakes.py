@@ -110,7 +110,8 @@ def rig_candidates(
         for order in permutations(wrong):
             sources = dict(zip(wrong, order, strict=True))
             names = ", ".join(
-                f"{cameras[view].name} has that of {cameras[k].name}" for view, k in sources.items()
+                f"{cameras[view].name} has the pose of {cameras[k].name}"
+                for view, k in sources.items()
             )
             yield (
                 _reordered(cameras, sources),

@@ -177,7 +177,7 @@ def with_images(shared: SharedFeatures, capture: Capture, order: tuple[int, ...]
         (
             (0, 3, 1, 2, 4, 5),
             {1, 2, 3},
-            "in another order .cam1 has that of cam3, cam2 has that of cam1",
+            "in another order .cam1 has the pose of cam3, cam2 has the pose of cam1",
         ),
     ],
 )
