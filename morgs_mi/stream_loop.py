@@ -52,8 +52,9 @@ from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.method.ssim import Target
 
 _LOG = logging.getLogger(__name__)
-# Growth of the resident memory after which releasing it pays; it takes some milliseconds.
-_GROWTH = 1.25
+# Growth of the resident memory after which releasing it pays: the next frame allocates its buffers
+# again.
+_GROWTH = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +242,7 @@ class StreamLoop:
         self.state = StreamState()
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
-        self._resident = 0  # bytes, when memory was last released
+        self._resident = 0  # bytes, before memory was last released
         # Whether images in a list may be in another order than the cameras.
         self._can_mistake_order = True
 
@@ -314,11 +315,12 @@ class StreamLoop:
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
         memory = process_memory()
-        # A frame with more active Gaussians than all before takes buffers of another size.
+        # A frame with more active Gaussians than all before takes buffers of another size; those of
+        # the first frame are not used again.
         if memory.get("resident", 0) > _GROWTH * self._resident:
+            self._resident = memory["resident"] if frame else 0
             release_memory()
             memory = process_memory()
-            self._resident = memory["resident"]
         return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)
 
     def _observation_ahead(self, images: Frame) -> FrameObservation | None:
