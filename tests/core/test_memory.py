@@ -64,8 +64,8 @@ def test_push__returns_memory_that_is_freed_to_the_system():
     loop = StreamLoop(rig()[:1], (), (), quick())
     image = np.zeros((rig()[0].height, rig()[0].width, 3), np.uint8)
     loop.push([image])
-    for _ in range(2):
-        freed = dr.arange(mi.Float, 10**8)
+    for count in (10**8, 2 * 10**8):  # of the same size it would be used again
+        freed = dr.arange(mi.Float, count)
         dr.eval(freed)
         dr.sync_thread()
         del freed
