@@ -154,8 +154,8 @@ def process_memory() -> dict[str, int]:
 def release_memory() -> None:
     """Return freed memory, which Dr.Jit and glibc keep for later, to the system."""
     dr.flush_malloc_cache()
-    with suppress(AttributeError, OSError, TypeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
+    with suppress(AttributeError):  # another C library
+        ctypes.pythonapi.malloc_trim(0)  # a handle that exists: a new one is a cycle of objects
 
 
 def _lines(path: str) -> list[str]:
