@@ -4,12 +4,13 @@ list of measures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
@@ -24,6 +25,8 @@ from morgs_mi.evaluate.measures import (
 )
 from morgs_mi.evaluate.results import Evaluation, FrameScores, Sizes, known_mean
 from morgs_mi.playback.streams import open_stream
+
+_UNKNOWN = (None, 0, ())  # Of a frame without a report.
 
 
 @interrupts_raised()
@@ -51,12 +54,13 @@ def evaluate_stream(
     Raises:
         FileNotFoundError: the stream or the capture is missing.
         ValueError: the stream is truncated, broken or empty, the stream was fitted to another
-            capture, the network does not accept images of this size, or the true tracks are broken.
+            capture or to other images of a frame, the network does not accept images of this size,
+            or the true tracks are broken.
     """
     stream = open_stream(out)
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
-    seconds, num_missing = _fitted(stream.path)
+    fitted = _fitted(stream.path)
     measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
     rows: list[FrameScores] = []
     for frame in clip.frames():
@@ -64,12 +68,17 @@ def evaluate_stream(
             for measure in measures:
                 measure.add_view(view)
         index = frame.state.frame
-        scores = _merged(measure.add_frame(frame) for measure in measures)
-        rows.append(
-            FrameScores(
-                index, frame.kind.name.lower(), frame.num_bytes, seconds.get(index), **scores
+        seconds, _, fingerprints = fitted.get(index, _UNKNOWN)
+        pairs = zip(fingerprints, image_fingerprints(frame.recorded), strict=False)
+        # An image may have been missing in the fit, or may be missing now.
+        if not any_recording and any(a != b for a, b in pairs if a and b):
+            raise ValueError(
+                f"{recording.path}: expected the recording that {stream.path} was fitted to, got "
+                f"other images in frame {index}; pass that capture (--capture), or compare with "
+                "any recording (--any-recording)."
             )
-        )
+        scores = _merged(measure.add_frame(frame) for measure in measures)
+        rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds, **scores))
         if progress is not None:
             progress(len(rows), len(clip.packets))
     num_fitted = len(recording.train_views)
@@ -81,7 +90,7 @@ def evaluate_stream(
         without_images=tuple(
             row.frame
             for row in rows
-            if np.isnan(row.scores.psnr) or num_missing.get(row.frame, 0) == num_fitted
+            if np.isnan(row.scores.psnr) or fitted.get(row.frame, _UNKNOWN)[1] == num_fitted
         ),
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=_sizes(stream.path.stat().st_size, rows),
@@ -105,18 +114,23 @@ def _sizes(num_bytes: int, rows: list[FrameScores]) -> Sizes:
     return Sizes(num_bytes, overhead, num_bytes / len(rows), mean("keyframe"), mean("residual"))
 
 
-def _fitted(stream: Path) -> tuple[dict[int, float], dict[int, int]]:
-    """Return seconds and numbers of views without an image, by frame, from the report beside the
-    stream; empty without one.
+def _fitted(stream: Path) -> dict[int, tuple[float | None, int, Sequence[str]]]:
+    """Return seconds, number of views without an image and the images' fingerprints, by frame, from
+    the report beside the stream; empty without one.
     """
     path = stream.with_name(REPORT)
     if not path.is_file():
-        return {}, {}
+        return {}
     report = read_json(path)
     try:
-        rows = {row["frame"]: row for row in report["frames"]}
-        seconds = {frame: float(row["seconds"]) for frame, row in rows.items()}
-        return seconds, {frame: len(row.get("missing_views", ())) for frame, row in rows.items()}
+        return {
+            row["frame"]: (
+                float(row["seconds"]),
+                len(row.get("missing_views", ())),
+                tuple(row.get("fingerprints", ())),
+            )
+            for row in report["frames"]
+        }
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"{path}: expected a fit's report, got a broken one ({error!r}); remove it."

@@ -30,6 +30,8 @@ class FrameReport:
         exposures: gain and bias of each view; empty if they are not estimated.
         memory: of the process, bytes: ``resident`` after the frame, and the ``peak`` so far; empty
             where the system does not report them.
+        fingerprints: of the images of all cameras, see `image_fingerprints`; empty if they were not
+            read from a recording.
     """
 
     frame: int
@@ -44,6 +46,7 @@ class FrameReport:
     steps: int = 0
     exposures: tuple[Exposure, ...] = ()
     memory: dict[str, int] = field(default_factory=dict)
+    fingerprints: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"

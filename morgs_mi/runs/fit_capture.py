@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.points import dense_points, match_capture
 from morgs_mi.codec.container import Packet
 from morgs_mi.core.entries import studio_entry
@@ -105,6 +106,7 @@ def stream_capture(
                     loop, frame, train, stage.report, upcoming, recording.show
                 )
                 report = prepared.completed(report, loop.gaussians, frame, config)
+                report = replace(report, fingerprints=image_fingerprints(frame.images))
                 recording.push(packet, report, loop.state.coded)
         return recording.reports
 

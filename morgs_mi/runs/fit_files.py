@@ -431,6 +431,7 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
             values = {
                 "seconds": float(row["seconds"]),
                 "missing_views": tuple(row["missing_views"]),
+                "fingerprints": tuple(row.get("fingerprints", ())),
                 "exposures": tuple(
                     Exposure(tuple(entry["gain"]), tuple(entry["bias"]))
                     for entry in row.get("exposures", ())

@@ -12,6 +12,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
@@ -76,6 +77,26 @@ def test_evaluate_stream__names_frames_that_were_fitted_without_images(fitted_cl
     finally:
         report.write_text(text)
     assert "frames 1 were fitted without any image" in capsys.readouterr().err
+
+
+def test_evaluate_stream__refuses_another_take_with_the_same_first_frame(fitted_clip) -> None:
+    report = fitted_clip / "report.json"
+    text = report.read_text()
+    frames = load_capture(fitted_clip / "capture").partial_frames()
+    rows = json.loads(text)["frames"]
+    for row, frame in zip(rows, frames, strict=True):
+        row["fingerprints"] = list(image_fingerprints(frame.images))
+    try:
+        report.write_text(json.dumps({"frames": rows}))
+        evaluate_stream(fitted_clip)
+        # One image was missing in the fit, another one was a different image.
+        rows[2]["fingerprints"] = ["", "00000000"]
+        report.write_text(json.dumps({"frames": rows}))
+        with pytest.raises(ValueError, match=r"got other images in frame 2; .*--any-recording"):
+            evaluate_stream(fitted_clip)
+        evaluate_stream(fitted_clip, any_recording=True)
+    finally:
+        report.write_text(text)
 
 
 def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(
