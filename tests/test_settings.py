@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, RenderConfig
+from morgs_mi import Camera
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import encode_packet
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, arms_of, types_of
@@ -34,7 +34,6 @@ BASE = StreamConfig(
     ),
     motion=MotionConfig(key_views=2, mask_interval=2),
     codec=CodecConfig(),
-    render=RenderConfig(reproducible=True),
 )
 # Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
 VALUES: dict[str, Any] = {
@@ -58,7 +57,7 @@ VALUES: dict[str, Any] = {
 }
 # Fields that cannot change this stream, each with the reason and the test that shows that it acts.
 ELSEWHERE: dict[str, str] = {
-    "render.reproducible": "changes the order of sums only: tests/render",
+    "render.reproducible": "acts on a GPU only: tests/test_gpu.py",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
     "fit.camera_priors": "the recorder refines cameras: tests/studio/calibration/test_bundle.py",

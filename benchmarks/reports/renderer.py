@@ -37,7 +37,7 @@ from morgs_mi.render.backend import block_shape
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-_MARKS = {"block": "s", "reproducible": "D"}
+_MARKS = {"block": "s"}
 _SEED = 1  # of the scene, the sample of pixels and their weights
 _MEDIAN_SCALE = 0.02  # of the standard deviations; the ball's radius is 1
 _SH_DEGREE = 1
@@ -103,10 +103,6 @@ def ladder() -> list[Setting]:
         width, height = (None, None) if shape == default_shape else shape
         config = replace(default, block_width=width, block_height=height)
         settings.append(Setting("block", f"{shape[0]}x{shape[1]}", config))
-    for flag in (False, True):
-        settings.append(
-            Setting("reproducible", str(flag).lower(), replace(default, reproducible=flag))
-        )
     return settings
 
 

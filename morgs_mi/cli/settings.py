@@ -31,7 +31,6 @@ SETTINGS = {
     "target_size": "codec.target_size",
     "refine_cameras": "fit.refine_cameras",
     "exposure": "fit.exposure",
-    "reproducible": "render.reproducible",
 }
 
 _PRESET = (
@@ -210,15 +209,11 @@ class Settings:
     """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld
     pixels gain).
     """
-    reproducible: Flag = False
-    """Same bytes on every run; 20 to 30 % slower."""
 
     def given(self) -> dict[str, Any]:
         """Return the settings that were given as options, by key."""
         values = {key: getattr(self, option) for option, key in SETTINGS.items()}
-        return {
-            key: value for key, value in values.items() if value is not None and value is not False
-        }
+        return {key: value for key, value in values.items() if value is not None}
 
     def option_names(self) -> dict[str, str]:
         """Return the options that were given, by their settings' keys and names."""

@@ -9,15 +9,16 @@ from morgs_mi.core.types import Int32, UInt32
 from morgs_mi.render.render_config import RenderConfig
 
 
-def _backend() -> dr.JitBackend:
-    return dr.backend_v(mi.Float)
+def on_cpu() -> bool:
+    """Return whether the active variant runs on the CPU."""
+    return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
 def block_shape(config: RenderConfig) -> tuple[int, int]:
     """Return (width, height) in pixels of one lane's block: 8x4 on a CPU, 4x4 on a GPU, unless
     `config` sets it.
     """
-    default_width = 8 if _backend() == dr.JitBackend.LLVM else 4
+    default_width = 8 if on_cpu() else 4
     return config.block_width or default_width, config.block_height or 4
 
 
@@ -26,18 +27,31 @@ def stable_order(keys: UInt32, buckets: int) -> UInt32:
 
     On a CPU one counting pass suffices. On a GPU that pass is stable for few buckets only.
     """
-    if _backend() == dr.JitBackend.LLVM:
+    if on_cpu():
         return dr.detail.block_mkperm(keys, dr.width(keys), buckets)
     return dr.argsort(keys)
 
 
 def add_mode() -> dr.ReduceMode:
-    """Return the mode of scatter-additions to one record per Gaussian.
+    """Return the mode of scatter-additions to the records of a lane's section, see `sections`."""
+    return dr.ReduceMode.NoConflicts if on_cpu() else dr.ReduceMode.Auto
 
-    On few CPU cores, one copy of the target per thread is 1.8 times faster than atomics (`Direct`)
-    on two threads.
+
+def sections(lanes: int) -> tuple[int, int, int]:
+    """Return (launches, sections, lanes) that divide the lanes of a kernel: each launch has equally
+    many sections, each section equally many lanes, the last ones without work.
+
+    Dr.Jit 1.5 divides a kernel on the CPU into two work units per thread, if they have at most
+    16384 lanes each (`LLVMThreadState::launch`). One thread runs the lanes of a unit in their
+    order. With records of its own, each unit adds without atomics and in a fixed order. On a GPU
+    all lanes add to the same records.
     """
-    return dr.ReduceMode.Expand if _backend() == dr.JitBackend.LLVM else dr.ReduceMode.Auto
+    if not on_cpu():
+        return 1, 1, lanes
+    units = 2 * dr.thread_count()
+    launches = -(-lanes // (16384 * units))
+    # Whole SIMD packets, of up to 32 lanes.
+    return launches, units, -(-lanes // (launches * units * 32)) * 32
 
 
 def on_aligned_stack(value: UInt32 | Int32) -> UInt32 | Int32:
@@ -47,7 +61,7 @@ def on_aligned_stack(value: UInt32 | Int32) -> UInt32 | Int32:
     packets later: they straddle cache lines, and the step takes 3 to 6 % longer. An array that is
     indexed at run time requires alignment.
     """
-    if _backend() != dr.JitBackend.LLVM:
+    if not on_cpu():
         return value
     local = dr.alloc_local(type(value), 2)
     place = mi.UInt32(value) & 1

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Float
+from morgs_mi.render.backend import on_cpu, sections
 from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.loops import (
@@ -21,7 +23,7 @@ from morgs_mi.render.loops import (
     record_packets,
     tangent,
 )
-from morgs_mi.render.region import Region, on_region, quotient
+from morgs_mi.render.region import NO_SLOT, Region, on_region, quotient
 
 
 def blend(
@@ -136,21 +138,39 @@ def _gradients(
     images' gradients.
     """
     N = dr.width(lists.by_rank)
-    arrays = (blocks, lists.records, images, grads)
+    arrays = (lists.records, images, grads)
     stride = 4 * record_packets(layout)
-    if layout.config.reproducible:
+    if layout.config.reproducible and not on_cpu():
         end = dr.cumsum(lists.count)
         first = end - lists.count
         dr.eval(first)
         pairs = dr.opaque(mi.Float, 0, max(int(end[-1]), 1) * 4 * pair_packets(layout))
-        pairs = _run(adjoint_of_pairs, layout, *arrays, first, pairs)
+        pairs = _run(adjoint_of_pairs, layout, blocks, *arrays, first, pairs)
         sums = _summed_by_rank(pairs, N, layout)
         stride = 4 * pair_packets(layout)
     else:
-        # Rounded up to a quarter octave: each target size of a scatter-reduction compiles its own
-        # kernel.
-        step = max(1024, 1 << max(N.bit_length() - 3, 0))
-        sums = _run(adjoint, layout, -(-N // step) * step, *arrays)
+        num_blocks = dr.width(lists.order)
+        launches, num_sections, lanes = sections(num_blocks)
+        sums = dr.opaque(mi.Float, 0, num_sections * N * stride)
+        # Dr.Jit adds in the order of the lanes within a section; the sections are added in theirs.
+        lane = dr.arange(mi.UInt32, num_sections * lanes)
+        first_record = dr.opaque(mi.UInt32, N) * quotient(lane, lanes)
+        dr.eval(first_record)
+        for launch in range(launches):
+            place = lane + dr.opaque(mi.UInt32, launch * num_sections * lanes)
+            is_block = place < dr.opaque(mi.UInt32, num_blocks)
+            order = dr.gather(mi.UInt32, lists.order, place, is_block)
+            order = dr.select(is_block, order, NO_SLOT)
+            dr.eval(order)
+            section_blocks = replace(blocks, order=order)
+            sums = _run(adjoint, layout, section_blocks, *arrays, first_record, sums)
+        place = dr.arange(mi.UInt32, N * stride)
+        parts = [
+            dr.gather(mi.Float, sums, place + dr.opaque(mi.UInt32, k * N * stride))
+            for k in range(num_sections)
+        ]
+        sums = sum(parts[1:], parts[0])
+        dr.eval(sums)
     lane = lists.rank_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
     return [

@@ -36,7 +36,7 @@ from morgs_mi.render.backend import add_mode, block_shape, on_aligned_stack
 from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.cut import PROFILE, Cut
 from morgs_mi.render.exp2 import exp2
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import NO_SLOT, Region
 from morgs_mi.render.render_config import RenderConfig
 
 _LN2 = log(2.0)
@@ -141,26 +141,28 @@ class _Block:
 
     def __init__(self, layout: Layout, blocks: Blocks) -> None:
         config = layout.config
-        order = blocks.order
+        is_block = blocks.order != NO_SLOT
+
+        def of_lane(values: UInt32) -> UInt32:
+            return dr.gather(mi.UInt32, values, blocks.order, is_block)
+
         self.width, self.height = block_shape(config)
         self.area = self.width * self.height
         self.log_min = log2(config.alpha_min)
         self.alpha_max = config.alpha_max
         self.stop = config.stop_transmittance
-        self.place = dr.gather(mi.UInt32, blocks.place, order)
-        self.rows = dr.gather(mi.UInt32, blocks.rows, order)
+        self.place = of_lane(blocks.place)
+        self.rows = of_lane(blocks.rows)
         self.pitch = dr.gather(mi.UInt32, blocks.pitch, mi.UInt32(0))
         # Centre of the first pixel.
-        self.x, self.y = (
-            mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y)
-        )
-        begin = dr.gather(mi.UInt32, blocks.begin, order)
-        first = dr.gather(mi.UInt32, blocks.first, order)
+        self.x, self.y = (mi.Float(of_lane(v)) + 0.5 for v in (blocks.x, blocks.y))
+        begin = of_lane(blocks.begin)
+        first = of_lane(blocks.first)
         # One depth limit per pixel, row by row; none without depth limits.
         self.limits = (
             [] if blocks.limits is None else [v for (v,) in _load_image(self, 1, blocks.limits)]
         )
-        self.end = on_aligned_stack(dr.gather(mi.UInt32, blocks.end, order))
+        self.end = on_aligned_stack(of_lane(blocks.end))
         # One word before the block's first, as `next_entry` expects.
         self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
 
@@ -308,34 +310,37 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
 
 def adjoint(
     layout: Layout,
-    ranks: int,
     blocks: Blocks,
     records: Float,
     images: list[Float],
     image_grads: list[Float],
+    first_record: UInt32,
+    sums: Float,
 ) -> Float:
-    """Return dL/d(record) of `ranks` ranks, one record each: the geometry's floats, the columns,
-    padding.
+    """Add dL/d(record) to `sums`, which has a record of each rank: the geometry's floats, the
+    columns, padding.
 
     Args:
         layout: description of the blend.
-        ranks: at least N. Scatter-reductions have their target's size as a literal in the kernel.
         blocks: the blocks and their lists.
         records: records of N ranks.
         images: images that `primal` returned.
         image_grads: their gradients.
+        first_record: the record of rank 0 that each lane adds to, see `backend.sections`.
+        sums: the records.
     """
     packets = record_packets(layout)
-    sums = dr.zeros(mi.Float, 4 * packets * ranks)
     mode = add_mode()
 
-    def add(sums: Float, grads: list[Float], rank: UInt32, pair: UInt32) -> None:
+    def add(sums: Float, grads: list[Float], rank: UInt32, first_record: UInt32) -> UInt32:
         grads = [*grads, *_floats(packets * 4 - len(grads))]
         for k in range(packets):
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
-            dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, rank * packets + k, mode=mode)
+            place = (first_record + rank) * packets + k
+            dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, place, mode=mode)
+        return first_record
 
-    return _adjoint(layout, blocks, records, images, image_grads, mi.UInt32(0), sums, add)
+    return _adjoint(layout, blocks, records, images, image_grads, first_record, sums, add)
 
 
 def adjoint_of_pairs(
@@ -355,12 +360,13 @@ def adjoint_of_pairs(
     """
     packets = pair_packets(layout)
 
-    def add(pairs: Float, grads: list[Float], rank: UInt32, pair: UInt32) -> None:
+    def add(pairs: Float, grads: list[Float], rank: UInt32, pair: UInt32) -> UInt32:
         grads = [*grads, dr.reinterpret_array(mi.Float, rank)]
         grads += _floats(packets * 4 - len(grads))
         for k in range(packets):
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
             dr.scatter(pairs, packet, pair * packets + k, mode=dr.ReduceMode.NoConflicts)
+        return pair + 1
 
     pair = dr.gather(mi.UInt32, first_pair, blocks.order)
     return _adjoint(layout, blocks, records, images, image_grads, pair, pairs, add)
@@ -377,9 +383,9 @@ def _adjoint(
     records: Float,
     images: list[Float],
     image_grads: list[Float],
-    pair: UInt32,
+    place: UInt32,
     target: Float,
-    add: Callable[[Float, list[Float], UInt32, UInt32], None],
+    add: Callable[[Float, list[Float], UInt32, UInt32], UInt32],
 ) -> Float:
     block = _Block(layout, blocks)
     geometric = layout.reaches_weights
@@ -391,7 +397,7 @@ def _adjoint(
         for g, v in zip(gradients, _load(block, layout, images), strict=True)
     ]
 
-    def body(walk, pair, end, x, y, limits, T, S, g, records, words, entries, target):
+    def body(walk, place, end, x, y, limits, T, S, g, records, words, entries, target):
         rank, walk = _advance(walk, end, words, entries)
         record = fetch_record(records, rank, G + C)
         geometry = record[:G]
@@ -426,16 +432,16 @@ def _adjoint(
             mean_grads, profile_grads = cut.gradients()
             total_grads = [a + b for a, b in zip(geometry_grads, mean_grads, strict=False)]
             geometry_grads = [*total_grads, *geometry_grads[2:], *profile_grads]
-        add(target, [*geometry_grads, *value_grads], rank, pair)
-        return walk, pair + 1, end, x, y, limits, T_next, S_next, g, records, words, entries, target
+        place = add(target, [*geometry_grads, *value_grads], rank, place)
+        return walk, place, end, x, y, limits, T_next, S_next, g, records, words, entries, target
 
     T = _floats(block.area, 1.0)
     suffix = suffix if geometric else []
-    walk = (block.walk, pair, block.end, block.x, block.y, block.limits)
+    walk = (block.walk, place, block.end, block.x, block.y, block.limits)
     state = (*walk, T, suffix, gradients, records, blocks.words, blocks.entries, target)
     *_, target = dr.while_loop(
         state,
-        lambda walk, pair, end, x, y, limits, T, *_: block.continues(walk, T),
+        lambda walk, place, end, x, y, limits, T, *_: block.continues(walk, T),
         body,
         label="blend (adjoint)",
     )

@@ -178,13 +178,9 @@ class Drawing:
         """
         if not dr.width(self.lanes):
             return np.zeros((self.count, channels), np.float32)
-        view = quotient(self.lanes, self.count)
-        row = self.lanes - view * dr.opaque(mi.UInt32, self.count)
-        totals = [dr.zeros(mi.Float, self.count) for _ in range(channels)]
-        for total, channel_sums in zip(totals, self._sums(image, channels), strict=True):
-            dr.scatter_add(total, channel_sums, row)
-        dr.eval(totals)
-        return np.stack([np.asarray(total) for total in totals], axis=1)
+        rows = np.asarray(self.lanes) % self.count
+        totals = [np.bincount(rows, sums, self.count) for sums in self._sums(image, channels)]
+        return np.stack(totals, axis=1).astype(np.float32)
 
     @with_render_lock
     def _sums(self, image: Float, channels: int) -> list[Float]:

@@ -58,8 +58,7 @@ def stream_capture(
             replaces them.
         config: settings.
         resume: continue after the last complete packet of the stream in `out`, if there is one.
-            With `RenderConfig(reproducible=True)` the stream has the same bytes as without an
-            interruption.
+            The stream has the same bytes as without an interruption.
         progress: called with (stage, done, total): matching views, the first frame, later frames.
 
     Returns:

@@ -223,7 +223,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
      * - reproducible
        - |bool|
-       - Whether gradients are summed in a fixed order, at twice the time. (Default: False)
+       - Whether gradients are summed in a fixed order on a GPU, as on the CPU. (Default: True)
 
      * - surfaces
        - |integrator|

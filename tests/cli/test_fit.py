@@ -114,7 +114,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
 ) -> None:
     clip = write_recording(tmp_path / "clip", 12)
     out = tmp_path / "out"
-    fit = ("fit", clip, out, *OPTIONS, "--reproducible")
+    fit = ("fit", clip, out, *OPTIONS)
     with monkeypatch.context() as patch:
         before_frame_2(patch, lambda: clip.rename(tmp_path / "away"))
         status, _, error = run(*fit)
@@ -380,7 +380,7 @@ def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> Non
 @pytest.mark.slow
 def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:
     out = tmp_path / "out"
-    fit = ("fit", capture, out, *OPTIONS, "--reproducible")
+    fit = ("fit", capture, out, *OPTIONS)
     assert run(*fit)[0] == 0
     whole = (out / "stream.morgs").read_bytes()
     (out / "stream.morgs").write_bytes(whole[: len(whole) * 3 // 4])

@@ -35,7 +35,7 @@ def printed_config(run, *args: object) -> StreamConfig:
         (("--preset", "paper", "--epochs", "2"), "motion.lift_flow", False),
         (("--preset", "paper", "--config", "FILE"), "motion.lift_flow", False),
         (("--config", "FILE", "--quality", "0.5"), "codec.quality", 0.5),
-        (("--config", "FILE"), "render.reproducible", True),
+        (("--config", "FILE"), "render.block_width", 4),
         (("--config", "FILE", "--flow", "dis"), "motion.flow_method", "dis"),
         (("--config", "FILE", "--target-size", "0"), "codec.target_size", 0),
     ],
@@ -47,7 +47,7 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(
     file.write_text(
         "[fit]\nepochs = 3\n[motion]\nflow_method = 'files:nowhere'\n[codec]\nquality = "
         "2.5\ntarget_size = 9\n"
-        "[render]\nreproducible = true\nblock_width = 4\n"
+        "[render]\nblock_width = 4\n"
     )
     config = printed_config(run, *(file if arg == "FILE" else arg for arg in args))
     assert reduce(getattr, key.split("."), config) == expected
@@ -83,7 +83,7 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(
                 "--target-size",
                 99,
             ),
-            *("--refine-cameras", "auto", "--exposure", "on", "--reproducible"),
+            *("--refine-cameras", "auto", "--exposure", "on"),
         ),
     ],
 )

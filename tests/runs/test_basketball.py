@@ -40,7 +40,6 @@ def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
         str(FRAMES),
         "--epochs",
         "2",
-        "--reproducible",
     ]
     assert cli.main(command) == 0
     assert cli.main(["eval", str(out), "--json", str(tmp_path / "eval.json")]) == 0

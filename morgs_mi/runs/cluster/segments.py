@@ -138,8 +138,8 @@ class SegmentedRun:
         """Fit, or continue, all segments and join them; return the reports of all frames.
 
         Args:
-            resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the
-                stream has the same bytes as without an interruption.
+            resume: continue the segments in `out`. The stream has the same bytes as without an
+                interruption.
 
         Raises:
             OSError: as `stream_capture`, a worker died several times, or the scheduler was lost.
