@@ -4,16 +4,17 @@ range is checked.
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from dataclasses import astuple, fields, is_dataclass, replace
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
 from morgs_mi import Camera
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import encode_packet
-from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, arms_of, types_of
+from morgs_mi.core.config import types_of
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
@@ -181,19 +182,21 @@ def bounds() -> list[tuple[Any, str, Any]]:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():
             bounds_of_arms = [
-                bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())
+                bound
+                for arm in (kind, *get_args(kind))
+                for bound in getattr(arm, "__metadata__", ())
             ]
             bounds_of_fields += [
-                (config, name, BEYOND[type(bound)](bound.limit)) for bound in bounds_of_arms
+                (config, name, BEYOND[type(bound)](*astuple(bound))) for bound in bounds_of_arms
             ]
     return bounds_of_fields
 
 
 BEYOND = {
-    AtLeast: lambda limit: limit - 1,
-    Above: lambda limit: limit,
-    AtMost: lambda limit: limit + 1 if limit < 1e9 else 2 * limit,
-    Below: lambda limit: limit,
+    Ge: lambda limit: limit - 1,
+    Gt: lambda limit: limit,
+    Le: lambda limit: limit + 1 if limit < 1e9 else 2 * limit,
+    Lt: lambda limit: limit,
     MultipleOf: lambda limit: limit + 1,
 }
 

@@ -27,7 +27,7 @@ from benchmarks.reports.tracks import track_scores
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.core.config_values import apply_values
+from morgs_mi.core.config import apply_values
 from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.loop.frame_report import FrameReport

@@ -26,6 +26,7 @@ from morgs_mi.capture.image_numbers import ImageNumbers, align_numbers
 from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.config import config_class
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import FrameReader
 
@@ -40,7 +41,7 @@ _SETTINGS = {*_INTERVALS, "test_view", "readout"}
 _NEAR = 0.5
 
 
-@dataclass(frozen=True)
+@config_class
 class ReadConfig:
     """How a capture is read: clips that do not match, which are refused by default, and near
     planes.

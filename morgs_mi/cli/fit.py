@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+from annotated_types import Ge
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
@@ -22,10 +23,9 @@ from morgs_mi.cli.settings import (
     held_out,
     optional,
 )
-from morgs_mi.core.config_values import config_toml
+from morgs_mi.core.config import check_value, config_toml
 from morgs_mi.core.documentation import page
 from morgs_mi.core.fit_names import STREAM
-from morgs_mi.core.ranges import AtLeast, check_value
 
 if TYPE_CHECKING:
     from morgs_mi.loop.frame_report import FrameReport
@@ -81,7 +81,7 @@ class Fit:
                 "options with several values, such as --test-view, and see morgs-mi fit --help."
             )
         if self.segments is not None:
-            check_value("fit()", "segments", self.segments, Annotated[int, AtLeast(1)])
+            check_value("fit()", "segments", self.segments, Annotated[int, Ge(1)])
         self.settings.check_methods(config)
         views = held_out(self.test_view)
         reading = self.reading.read_config()

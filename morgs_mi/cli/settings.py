@@ -13,7 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.config_values import apply_values, read_config, relocated
+from morgs_mi.core.config import apply_values, read_config, relocated
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
+from annotated_types import Ge, Gt, Le
+
+from morgs_mi.core.config import config_class
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class CodecConfig:
     """Settings of the encoder; a decoder needs none of them.
 
@@ -22,22 +21,19 @@ class CodecConfig:
         ValueError: a number is out of range.
     """
 
-    quality: Annotated[float, Above(0)] = 1.0
+    quality: Annotated[float, Gt(0)] = 1.0
     """Divisor of the tolerated errors (see `core.attributes`): 2 doubles the precision of
     everything, 1000 is as good as float32."""
-    birth_precision: Annotated[float, AtLeast(1), AtMost(1024)] = 4.0
+    birth_precision: Annotated[float, Ge(1), Le(1024)] = 4.0
     """Factor of the precision of new Gaussians: they are written once and seen for many frames."""
     offset: bool = False
     """Storage of the learned offset of moving Gaussians, for viewing; no other value is decoded
     from it.
     """
-    target_size: Annotated[int, AtLeast(0)] = 0
+    target_size: Annotated[int, Ge(0)] = 0
     """Bound of the bytes of a later frame, which is coded more coarsely until it fits; 0: no bound.
     """
-    keyframe_interval: Annotated[int, AtLeast(0)] = 30
+    keyframe_interval: Annotated[int, Ge(0)] = 30
     """Frames between re-emitted keyframes, which contain the whole state and at which a reader can
     start; 0: never.
     """
-
-    def __post_init__(self) -> None:
-        check_ranges(self)

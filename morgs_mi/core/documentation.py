@@ -6,7 +6,8 @@ import ast
 import inspect
 import re
 import textwrap
-from dataclasses import MISSING, Field, fields
+from contextlib import suppress
+from dataclasses import is_dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -39,12 +40,9 @@ def with_pages(text: str) -> str:
 def field_docs(config_type: type) -> dict[str, str]:
     """Return the docstrings of a dataclass's fields by name; none without source code."""
     docs: dict[str, str] = {}
-    for base in reversed(config_type.__mro__):
-        try:
-            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
-            continue
-        for pair in pairwise(getattr(definition, "body", ())):
+    with suppress(OSError):
+        definition: Any = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
+        for pair in pairwise(definition.body):
             match pair:
                 case (
                     ast.AnnAssign(target=ast.Name(id=name)),
@@ -63,7 +61,7 @@ def documented(config_type: type[Class]) -> type[Class]:
 
 
 class _ListedFields:
-    """Docstring of a dataclass that reads the source of the class when it is first used.
+    """Docstring of a dataclass that reads the source of the class when it is used.
 
     Attributes:
         text: the docstring without the list of fields.
@@ -73,26 +71,10 @@ class _ListedFields:
         self.text = text
 
     def __get__(self, instance: Any, config_type: Any) -> str:
-        return f"{self.text}\n\nFields:\n{_field_list(config_type)}"
-
-
-@cache
-def _field_list(config_type: Any) -> str:
-    docs = field_docs(config_type)
-    entries = (
-        f"{f.name} = {_default(f)}: {' '.join(docs.get(f.name, '').split())}"
-        for f in fields(config_type)
-    )
-    lines = (textwrap.wrap(with_pages(entry), 116, break_on_hyphens=False) for entry in entries)
-    return "\n".join(textwrap.indent("\n    ".join(line), "    ") for line in lines)
-
-
-def _default(field: Field) -> str:
-    """Return the default of a field as text; the name of the class for a nested config."""
-    if field.default is not MISSING:
-        return repr(field.default)
-    return (
-        f"{type(field.default_factory()).__name__}(...)"
-        if field.default_factory is not MISSING
-        else "(required)"
-    )
+        lines = [self.text, "", "Fields:"]
+        for name, value in vars(config_type()).items():
+            default = f"{type(value).__name__}(...)" if is_dataclass(value) else repr(value)
+            text = " ".join(field_docs(config_type).get(name, "").split())
+            entry = with_pages(f"    {name} = {default}: {text}")
+            lines += textwrap.wrap(entry, 120, subsequent_indent=8 * " ", break_on_hyphens=False)
+        return "\n".join(lines)

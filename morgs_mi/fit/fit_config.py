@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from typing import Annotated, Literal
 
+from annotated_types import Ge, Gt, Le, Lt
+
 from morgs_mi.core.attributes import ATTRIBUTES
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, check_ranges
+from morgs_mi.core.config import config_class
 from morgs_mi.method.objective import ObjectiveConfig
 
 # Epochs of a later frame before the learning rate of the means begins to decay.
@@ -20,8 +21,7 @@ _LEAST_STEPS = 1200
 _GAUSSIANS_PER_STEP = 25
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class LearningRates:
     """Adam's learning rate of every parameter, per step.
 
@@ -30,23 +30,20 @@ class LearningRates:
     has under a hundred.
     """
 
-    means: Annotated[float, AtLeast(0)] = 5e-4
+    means: Annotated[float, Ge(0)] = 5e-4
     """Learning rate of the means, motion and offset, in scene extents."""
-    scales: Annotated[float, AtLeast(0)] = 1e-2
+    scales: Annotated[float, Ge(0)] = 1e-2
     """Learning rate of the logarithms of the scales."""
-    quats: Annotated[float, AtLeast(0)] = 1e-2
+    quats: Annotated[float, Ge(0)] = 1e-2
     """Learning rate of the rotations."""
-    opacities: Annotated[float, AtLeast(0)] = 0.05
+    opacities: Annotated[float, Ge(0)] = 0.05
     """Learning rate of the logits of the opacities."""
-    sh_dc: Annotated[float, AtLeast(0)] = 1e-2
+    sh_dc: Annotated[float, Ge(0)] = 1e-2
     """Learning rate of the constant SH coefficient."""
-    sh_rest: Annotated[float, AtLeast(0)] = 5e-4
+    sh_rest: Annotated[float, Ge(0)] = 5e-4
     """Learning rate of the other SH coefficients: a twentieth of the constant one's, as in 3DGS."""
-    confidence: Annotated[float, AtLeast(0)] = 0.05
+    confidence: Annotated[float, Ge(0)] = 0.05
     """Learning rate of the logits of the confidence."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def by_parameter(self, extent: float) -> dict[str, float]:
         """Return the learning rate of every parameter of the attribute table by its name; `extent`
@@ -64,49 +61,43 @@ class LearningRates:
         return rates
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class DensityConfig:
     """Settings of density control (see `density`), with thresholds from the literature."""
 
-    rounds: Annotated[int, AtLeast(0)] = 6
+    rounds: Annotated[int, Ge(0)] = 6
     """Rounds of density control in the first frame; 0: none. With them, the first frame starts from
     half of its Gaussians and grows to all."""
     later_frames: bool = True
     """One round of density control in every later frame."""
-    births: Annotated[float, AtLeast(0)] = 0.02
+    births: Annotated[float, Ge(0)] = 0.02
     """Largest number of births in a later frame, as a fraction of the Gaussians."""
-    max_gaussians: Annotated[int, AtLeast(1)] = 60_000
+    max_gaussians: Annotated[int, Ge(1)] = 60_000
     """Number of Gaussians beyond which a later frame adds none unless others are pruned."""
-    split_scale: Annotated[float, AtLeast(0)] = 0.01
+    split_scale: Annotated[float, Ge(0)] = 0.01
     """Scale, in scene extents, above which the first frame splits a Gaussian instead of cloning it.
     """
-    min_error: Annotated[float, AtLeast(0)] = 0.1
+    min_error: Annotated[float, Ge(0)] = 0.1
     """Attributed error, in pixels of full contrast, below which a later frame does not densify a
     Gaussian.
     """
-    min_opacity: Annotated[float, Above(0), Below(1)] = 0.005
+    min_opacity: Annotated[float, Gt(0), Lt(1)] = 0.005
     """Opacity below which a Gaussian is pruned."""
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
-
-@documented
-@dataclass(frozen=True)
+@config_class
 class DetailConfig:
     """Settings of the number of Gaussians of the first frame where none is given (see `detail`)."""
 
-    per_detail: Annotated[float, Above(0)] = 1.5
+    per_detail: Annotated[float, Gt(0)] = 1.5
     """Gaussians per detail that the views do not share."""
-    least_gaussians: Annotated[int, AtLeast(1)] = 4_000
+    least_gaussians: Annotated[int, Ge(1)] = 4_000
     """Least number of Gaussians."""
-    most_gaussians: Annotated[int, AtLeast(1)] = 250_000
+    most_gaussians: Annotated[int, Ge(1)] = 250_000
     """Largest number of Gaussians, for memory, the time of later frames and the size of the stream.
     """
 
     def __post_init__(self) -> None:
-        check_ranges(self)
         if self.least_gaussians > self.most_gaussians:
             raise ValueError(
                 "DetailConfig(): `least_gaussians` must be 1 to `most_gaussians` = "
@@ -114,66 +105,57 @@ class DetailConfig:
             )
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class CameraPriors:
     """Standard deviations of the errors of a calibration, under which its cameras are refined."""
 
-    rotation: Annotated[float, Above(0)] = 0.5
+    rotation: Annotated[float, Gt(0)] = 0.5
     """Rotation about each axis, degrees."""
-    position: Annotated[float, Above(0)] = 0.005
+    position: Annotated[float, Gt(0)] = 0.005
     """Position along each axis, in scene extents."""
-    focal: Annotated[float, Above(0)] = 0.01
+    focal: Annotated[float, Gt(0)] = 0.01
     """Focal lengths, relative."""
-    distortion: Annotated[float, Above(0)] = 0.1
+    distortion: Annotated[float, Gt(0)] = 0.1
     """First term of radial distortion that the calibrated lens leaves; the second has a fifth of
     this deviation.
     """
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
-
-@documented
-@dataclass(frozen=True)
+@config_class
 class ShortFitConfig:
     """Settings of the short fits with which cameras are refined and balanced, and the results are
     compared.
     """
 
-    gaussians: Annotated[int, AtLeast(4)] = 4000
+    gaussians: Annotated[int, Ge(4)] = 4000
     """Number of Gaussians."""
-    steps: Annotated[int, AtLeast(2)] = 300
+    steps: Annotated[int, Ge(2)] = 300
     """Steps of a fit; each further round takes half as many."""
-    rounds: Annotated[int, AtLeast(1)] = 5
+    rounds: Annotated[int, Ge(1)] = 5
     """Rounds of fitting Gaussians and changing the cameras."""
-    width: Annotated[int, AtLeast(1)] = 320
+    width: Annotated[int, Ge(1)] = 320
     """Least width to which images are reduced, px."""
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
-
-@documented
-@dataclass(frozen=True)
+@config_class
 class FitConfig:
     """Settings of the optimisation."""
 
-    sh_degree: Annotated[int, AtLeast(0), AtMost(3)] = 1
+    sh_degree: Annotated[int, Ge(0), Le(3)] = 1
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
-    num_gaussians: Annotated[int, AtLeast(1)] | None = None
+    num_gaussians: Annotated[int, Ge(1)] | None = None
     """Number of Gaussians of the first frame; None: from the detail of its images and its time (see
     `budget`). It starts from `first_count`."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """Number of Gaussians where none is given."""
-    first_frame_steps: Annotated[int, AtLeast(1)] | None = None
+    first_frame_steps: Annotated[int, Ge(1)] | None = None
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see
     `budget`).
     """
-    first_frame_seconds: Annotated[float, Above(0)] = 120.0
+    first_frame_seconds: Annotated[float, Gt(0)] = 120.0
     """Time that the first frame may take on two cores of a server: it limits those numbers of
     Gaussians and of steps that are not given."""
-    dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
+    dropping: Annotated[float, Ge(0), Lt(1)] | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`);
     None: from the noise of the images and the angles between the views."""
     noise_aware: bool = True
@@ -188,15 +170,15 @@ class FitConfig:
     are taken if withheld pixels show that they are real) or on (always taken)."""
     short_fits: ShortFitConfig = field(default_factory=ShortFitConfig)
     """Fits for the refinement of the cameras and for their exposures."""
-    confidence_steps: Annotated[int, AtLeast(0)] = 40
+    confidence_steps: Annotated[int, Ge(0)] = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
-    epochs: Annotated[int, AtLeast(1)] = 8
+    epochs: Annotated[int, Ge(1)] = 8
     """Most passes over all training views for every later frame; the paper's small variant takes 5.
     """
     skip_static: bool = True
     """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`).
     """
-    early_stopping_tolerance: Annotated[float, AtLeast(0)] = 1e-6
+    early_stopping_tolerance: Annotated[float, Ge(0)] = 1e-6
     """Relative decrease of the objective over two epochs below which a later frame ends early; 0:
     never.
     """
@@ -216,9 +198,6 @@ class FitConfig:
     """Learning rates at the start of the first frame. The confidence is fitted alone, at a constant
     rate.
     """
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def rates_at(self, epoch: int) -> LearningRates:
         """Return the learning rates of an epoch of a later frame, counted from 0.

@@ -11,18 +11,18 @@ Presets:
                                       (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no
-preset. `core.config_values` reads settings from TOML files and writes them.
+preset. `core.config` reads settings from TOML files and writes them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any, Literal
 
+from annotated_types import Ge
+
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.core.config_values import apply_values
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import AtLeast, check_ranges
+from morgs_mi.core.config import apply_values, config_class
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
@@ -30,8 +30,7 @@ from morgs_mi.render.render_config import RenderConfig
 PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class StreamConfig:
     """Settings of the streaming loop.
 
@@ -47,11 +46,8 @@ class StreamConfig:
     """Rasteriser."""
     codec: CodecConfig = field(default_factory=CodecConfig)
     """Precision and size of the stream."""
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Ge(0)] = 0
     """Seed of every random choice: order of the views, added points."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 def _modules(motion: bool, offset: bool, confidence: bool) -> dict[str, Any]:

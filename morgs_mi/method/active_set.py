@@ -21,12 +21,12 @@ from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
+from annotated_types import Ge
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.documentation import documented
+from morgs_mi.core.config import config_class
 from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.change import connected_labels
@@ -52,22 +52,18 @@ _MIN_OVERLAP = 0.35
 QUIET = 0.2
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class ActiveSetConfig:
     """Settings of the selection, see the module."""
 
-    min_responsibility: Annotated[float, AtLeast(0)] = 0.05
+    min_responsibility: Annotated[float, Ge(0)] = 0.05
     """Responsibility above which a Gaussian is active."""
-    min_weight: Annotated[float, AtLeast(0)] = 0.2
+    min_weight: Annotated[float, Ge(0)] = 0.2
     """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
     hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
     later."""
-    quiet_views: Annotated[int, AtLeast(1)] = 12
+    quiet_views: Annotated[int, Ge(1)] = 12
     """Number of views in which active Gaussians that hardly change are rendered."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,13 @@ so it counts once it has grown.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import AtLeast, check_ranges
+from morgs_mi.core.config import config_class
 
 # Of 1; also the least threshold, and the bound of the noise of the whole image.
 _GREY_LEVEL = 1 / 255
@@ -45,21 +44,17 @@ _SUM = np.ones((1, 3), np.float32)
 _COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class ChangeConfig:
     """Settings of the change detection."""
 
-    sigmas: Annotated[float, AtLeast(0)] = 5.0
+    sigmas: Annotated[float, Ge(0)] = 5.0
     """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4
     million pixels.
     """
-    min_peak: Annotated[float, AtLeast(0)] = 4 * _GREY_LEVEL
+    min_peak: Annotated[float, Ge(0)] = 4 * _GREY_LEVEL
     """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0:
     none. Blocks of compressed video change by less."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 def change_mask(

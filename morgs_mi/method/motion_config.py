@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated
 
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
+from annotated_types import Ge, Le
+
+from morgs_mi.core.config import config_class
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
@@ -17,8 +18,7 @@ from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class MotionConfig:
     """Settings of the motion modules; the first three are the rows of the paper's ablation.
 
@@ -61,18 +61,18 @@ class MotionConfig:
     mask_method: str = "grabcut"
     """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
     sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
-    key_views: Annotated[int, AtLeast(1)] = 4
+    key_views: Annotated[int, Ge(1)] = 4
     """Number of cameras with optical flow and masks."""
-    mask_interval: Annotated[int, AtLeast(1)] = 5
+    mask_interval: Annotated[int, Ge(1)] = 5
     """Frames from one supervision of the confidence by masks to the next."""
-    cohesion_weight: Annotated[float, AtLeast(0)] = 50.0
+    cohesion_weight: Annotated[float, Ge(0)] = 50.0
     """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian
     alone (see `cohesion`); 0: no cohesion."""
     model: str = "none"
     """Motion that Gaussians share, fitted before the residual: none, or a registered model (see
     docs/extending.md).
     """
-    model_share: Annotated[float, AtLeast(0), AtMost(1)] = 0.5
+    model_share: Annotated[float, Ge(0), Le(1)] = 0.5
     """Fraction of a later frame's epochs that fit this model, at least one epoch."""
     flow: FlowConfig = field(default_factory=FlowConfig)
     """Optical flow and its forward-backward check."""
@@ -86,7 +86,6 @@ class MotionConfig:
     """Detection of changed pixels."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
         FLOW_SOURCES.check(self.flow_method, "MotionConfig()")
         MASK_REFINERS.check(self.mask_method, "MotionConfig()")
         MOTION_MODELS.check(self.model, "MotionConfig()")

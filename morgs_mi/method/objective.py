@@ -20,11 +20,11 @@ from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from morgs_mi.core.checks import check_number
-from morgs_mi.core.documentation import documented
+from morgs_mi.core.config import config_class
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
@@ -38,8 +38,7 @@ from morgs_mi.render.region import Region
 Observations = Mapping[str, Any]
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class ObjectiveConfig:
     """Weights of the terms; 0 switches one off.
 
@@ -47,25 +46,24 @@ class ObjectiveConfig:
         ValueError: a weight is out of range, or a further term is not registered or named twice.
     """
 
-    dssim_weight: Annotated[float, AtLeast(0), AtMost(1)] = 0.2
+    dssim_weight: Annotated[float, Ge(0), Le(1)] = 0.2
     """lambda of eq. 2."""
-    flow_weight: Annotated[float, AtLeast(0)] = 0.01
+    flow_weight: Annotated[float, Ge(0)] = 0.01
     """lambda_flow of eq. 13, per px of endpoint error."""
-    mask_weight: Annotated[float, AtLeast(0)] = 0.5
+    mask_weight: Annotated[float, Ge(0)] = 0.5
     """lambda_mask of eq. 13."""
-    offset_weight: Annotated[float, AtLeast(0)] = 0.01
+    offset_weight: Annotated[float, Ge(0)] = 0.01
     """lambda_off of eq. 13, per scene extent."""
-    rigid_weight: Annotated[float, AtLeast(0)] = 0.0
+    rigid_weight: Annotated[float, Ge(0)] = 0.0
     """Weight of the local rigidity (see `rigidity`), per scene extent."""
-    rotation_weight: Annotated[float, AtLeast(0)] = 0.0
+    rotation_weight: Annotated[float, Ge(0)] = 0.0
     """Weight of the similarity of rotations there."""
-    isometry_weight: Annotated[float, AtLeast(0)] = 0.0
+    isometry_weight: Annotated[float, Ge(0)] = 0.0
     """Weight of the isometry there, per scene extent."""
     terms: tuple[str, ...] = ()
     """Registered terms, NAME:WEIGHT each (see docs/extending.md)."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
         for text in self.terms:
             LOSS_TERMS.check(text, "ObjectiveConfig()")
             _weight(text.partition(":")[2])

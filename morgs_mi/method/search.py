@@ -21,15 +21,15 @@ from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.core.documentation import documented
+from morgs_mi.core.config import config_class
 from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.render.view_group import ViewGroup
@@ -51,18 +51,14 @@ _ERROR_RATIO = 0.8
 _LOGIT = 0.3
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class SearchConfig:
     """Settings of the coarse search."""
 
-    reach: Annotated[float, Above(0), AtMost(1)] = 0.1
+    reach: Annotated[float, Gt(0), Le(1)] = 0.1
     """Longest displacement along each axis, as a fraction of the image width."""
-    max_parts: Annotated[int, AtLeast(0)] = 3
+    max_parts: Annotated[int, Ge(0)] = 3
     """Most parts of a frame, those with the largest errors first."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 def search_motion(

@@ -21,7 +21,7 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import bounded, check_number
-from morgs_mi.core.config_values import apply_values
+from morgs_mi.core.config import apply_values
 from morgs_mi.core.fit_names import CAPTURE, STREAM
 from morgs_mi.playback.source import as_fitted
 from morgs_mi.render.render_config import RenderConfig

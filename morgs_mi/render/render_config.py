@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, check_ranges
+from annotated_types import Ge, Gt, Le, Lt, MultipleOf
+
+from morgs_mi.core.config import config_class
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class RenderConfig:
     """Settings of the rasteriser. The defaults match 3DGS, because its models depend on them."""
 
-    eps2d: Annotated[float, AtLeast(0), AtMost(1e18)] = 0.3  # beyond, float32 overflows
+    eps2d: Annotated[float, Ge(0), Le(1e18)] = 0.3  # beyond, float32 overflows
     """Low-pass filter in px^2, added to the projected covariance; it prevents splats from falling
     between pixels.
     """
@@ -22,28 +21,27 @@ class RenderConfig:
     """Reduce the opacity by what the low-pass filter adds to a splat's area, sqrt(det S / det (S +
     eps2d I)) (Yu et al. 2024): small splats fade instead of growing. For models that were trained
     so."""
-    alpha_min: Annotated[float, Above(0)] = 1.0 / 255.0
+    alpha_min: Annotated[float, Gt(0)] = 1.0 / 255.0
     """Alpha below which a Gaussian is skipped at a pixel: it cannot change an 8-bit image."""
-    alpha_max: Annotated[float, Above(0), Below(1)] = 0.99
+    alpha_max: Annotated[float, Gt(0), Lt(1)] = 0.99
     """Upper limit of alpha; it bounds 1 / (1 - alpha) in the adjoint."""
-    stop_transmittance: Annotated[float, AtLeast(0), Below(1)] = 1e-4
+    stop_transmittance: Annotated[float, Ge(0), Lt(1)] = 1e-4
     """Transmittance of its most transparent pixel below which a block ends; bounds the error of the
     colour.
     """
     first_order_motion: bool = False
     """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the
     difference of two projections. The relative difference is motion in depth / depth."""
-    block_width: Annotated[int, AtLeast(4), AtMost(16), MultipleOf(4)] | None = None
+    block_width: Annotated[int, Ge(4), Le(16), MultipleOf(4)] | None = None
     """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4.
     None: 8 on the CPU, 4 on the GPU."""
-    block_height: Annotated[int, AtLeast(1), AtMost(16)] | None = None
+    block_height: Annotated[int, Ge(1), Le(16)] | None = None
     """Height in pixels of that block, 1 to 16; None: 4."""
     reproducible: bool = True
     """Sum gradients in a fixed order on a GPU too: the same bytes on every run, for 48 bytes of
     memory for every pair of Gaussian and block. The CPU's order is fixed, by its threads."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
         if self.alpha_min >= self.alpha_max:
             raise ValueError(
                 f"RenderConfig(): `alpha_min` must be below `alpha_max` = {self.alpha_max}, got "

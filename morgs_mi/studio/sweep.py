@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.core.config import check_value
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.progress import Progress, Report
-from morgs_mi.core.ranges import AtLeast, check_value
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.loop.stream_config import StreamConfig
@@ -63,7 +64,7 @@ def sweep(
         OSError: as `stream_capture`.
     """
     for name, value in (("seeds", seeds), *(("epochs", value) for value in epochs)):
-        check_value("sweep()", name, value, Annotated[int, AtLeast(1)])
+        check_value("sweep()", name, value, Annotated[int, Ge(1)])
     config = config or StreamConfig()
     _compile_kernels(capture, config)
     rows: list[Scores] = []

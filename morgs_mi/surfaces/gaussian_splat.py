@@ -16,9 +16,9 @@ from morgs_mi.core.attributes import BY_ACTIVATED_NAME, shape_attribute_widths
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import bounded
 from morgs_mi.core.color_space import decode_traced
+from morgs_mi.core.config import check_value
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
-from morgs_mi.core.ranges import check_value
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.render.channels import aov_attributes, exr_names
 from morgs_mi.render.kernel_recording import render_lock

@@ -14,7 +14,7 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.settings import SETTINGS, Reading
-from morgs_mi.core.config_values import apply_values, config_toml
+from morgs_mi.core.config import apply_values, config_toml
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.studio.live.live_config import LIVE_STREAM
 

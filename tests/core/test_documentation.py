@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from morgs_mi.core import documentation
-from morgs_mi.core.config_values import config_toml
+from morgs_mi.core.config import config_toml
 from morgs_mi.core.documentation import documented, field_docs, page, with_pages
 from morgs_mi.loop.stream_config import StreamConfig
 
@@ -21,26 +21,25 @@ SOURCES = sorted((ROOT / "morgs_mi").rglob("*.py"))
 
 @dataclass
 class Stem:
-    """Base."""
-
-    number: float = 1e-5
-    """Length
-    in px."""
+    """A stem."""
 
 
 @documented
 @dataclass
-class Plant(Stem):
+class Plant:
     """A plant.
 
     Raises:
         ValueError: never.
     """
 
+    number: float = 1e-5
+    """Length
+    in px."""
     name: str = "a"
     """Name, see docs/flow.md."""
-    leaves: list = field(default_factory=list)
-    roots: int = field(kw_only=True)
+    stem: Stem = field(default_factory=Stem)
+    roots: int = 3
     """Number of roots."""
 
 
@@ -51,8 +50,7 @@ def test_field_docs__returns_docstrings_by_field() -> None:
         "roots": "Number of roots.",
     }
     assert field_docs(Plant) == docs
-    assert field_docs(int) == {}
-    without_source: dict[str, Any] = {"__name__": "builtins"}
+    without_source: dict[str, Any] = {"__name__": "__main__"}
     exec("from dataclasses import dataclass\n@dataclass\nclass A:\n    a: int = 1", without_source)
     assert field_docs(without_source["A"]) == {}
 
@@ -66,9 +64,9 @@ Raises:
 Fields:
     number = 1e-05: Length in px.
     name = 'a': Name, see docs/flow.md.
-    leaves = list(...):
-    roots = (required): Number of roots."""
-    assert Plant.__doc__ == inspect.getdoc(Plant) == Plant(roots=1).__doc__ == expected
+    stem = Stem(...):
+    roots = 3: Number of roots."""
+    assert Plant.__doc__ == inspect.getdoc(Plant) == Plant().__doc__ == expected
 
 
 def test_page__is_a_path_in_the_checkout() -> None:

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.core.config_values import config_toml
+from morgs_mi.core.config import config_toml
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.studio import sweep as module

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import AtLeast, check_ranges
+from annotated_types import Ge
+
+from morgs_mi.core.config import config_class
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class FlowConfig:
     """Settings of OpenCV's methods and of the forward-backward check.
 
@@ -18,16 +17,13 @@ class FlowConfig:
         ValueError: a number is out of range.
     """
 
-    fine_width: Annotated[int, AtLeast(0)] = 480
+    fine_width: Annotated[int, Ge(0)] = 480
     """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half
     resolution.
     """
-    consistency_relative: Annotated[float, AtLeast(0)] = 0.01
+    consistency_relative: Annotated[float, Ge(0)] = 0.01
     """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both
     flows.
     """
-    consistency_absolute: Annotated[float, AtLeast(0)] = 0.5
+    consistency_absolute: Annotated[float, Ge(0)] = 0.5
     """Forward-backward check: tolerated squared mismatch of the shortest flows, px^2."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
-from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import AtLeast, check_ranges
+from annotated_types import Ge
+
+from morgs_mi.core.config import config_class
 
 
-@documented
-@dataclass(frozen=True)
+@config_class
 class MaskConfig:
     """Settings of the flow mask (eq. 9) and of its refinement (eq. 10).
 
@@ -18,20 +17,17 @@ class MaskConfig:
         ValueError: a number is out of range.
     """
 
-    threshold_mads: Annotated[float, AtLeast(0)] = 4.0
+    threshold_mads: Annotated[float, Ge(0)] = 4.0
     """Speed above which a pixel moves: this many median absolute deviations above the median."""
-    floor: Annotated[float, AtLeast(0)] = 0.5
+    floor: Annotated[float, Ge(0)] = 0.5
     """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
     proportional to the width, as the motion of a scene is."""
-    working_width: Annotated[int, AtLeast(1)] = 320
+    working_width: Annotated[int, Ge(1)] = 320
     """Width in pixels to which GrabCut and superpixels reduce an image. Their cost grows with the
     number of pixels, and a mask needs the object's outline, not its details."""
-    superpixel_share: Annotated[float, AtLeast(0)] = 0.75
+    superpixel_share: Annotated[float, Ge(0)] = 0.75
     """Share of a superpixel that must lie in the flow mask. Flow bleeds outwards onto the static
     surroundings of an object, all of which a bare majority would include."""
-    prompts: Annotated[int, AtLeast(1)] = 16
+    prompts: Annotated[int, Ge(1)] = 16
     """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
     of the decoder; the smaller ones stay as they are in the flow mask."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)

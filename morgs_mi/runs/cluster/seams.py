@@ -9,13 +9,14 @@ the others follow as usual. What has not changed since the first frames stays as
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
 from morgs_mi.codec.packets import CodedFrame
-from morgs_mi.core.ranges import AtLeast, check_ranges
+from morgs_mi.core.config import config_class
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.observation import Setup
 from morgs_mi.loop.stream_config import StreamConfig
@@ -34,26 +35,23 @@ _BIRTHS = 0.1
 _OVERLAP_EPOCHS = 2
 
 
-@dataclass(frozen=True)
+@config_class
 class SegmentConfig:
     """Segments of a fit, and the seams between them."""
 
     count: int = 1
     """Number of segments of about the same length, of two frames at least; with one, the stream
     equals `stream_capture`'s."""
-    passes: Annotated[int, AtLeast(1)] = 24
+    passes: Annotated[int, Ge(1)] = 24
     """Fits of the first frame of the overlap, one after the other, each with a round of density
     control.
     """
-    epochs: Annotated[int, AtLeast(1)] = 4
+    epochs: Annotated[int, Ge(1)] = 4
     """Passes over all training views in each of them."""
-    overlap: Annotated[int, AtLeast(0)] = 10
+    overlap: Annotated[int, Ge(0)] = 10
     """Frames before a segment that are fitted as well: its Gaussians then follow the recording from
     its first frame.
     """
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def overlap_config(self, config: StreamConfig) -> StreamConfig:
         """Return the settings of the other frames of the overlap."""

@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Lt
 
 from morgs_mi.capture.layouts.clips import (
     EXAMPLE,
@@ -32,10 +33,9 @@ from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.color_space import display_image, display_stops
+from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
-from morgs_mi.core.ranges import check_ranges
 from morgs_mi.io.video import open_clips
 from morgs_mi.studio.calibration.checks.mistakes import same_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
@@ -61,8 +61,6 @@ _MORE_TEXTURE = (
     "light the scene evenly, add textured objects, or record a frame with such objects before the "
     "take"
 )
-# Seeds that COLMAP takes.
-_SEEDS = "[0, 2147483647]"
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,8 @@ class CalibrateConfig:
     """Frame to calibrate on; in clips of variable frame rate, the one nearest in time."""
     partial: bool = False
     """Accept a model that lacks some of the cameras."""
-    seed: int = 0
+    # COLMAP takes no others.
+    seed: Annotated[int, Ge(0), Lt(2**31)] = 0
     """Seed of COLMAP's random samples."""
 
 
@@ -160,7 +159,6 @@ def calibrate(
     """
     path = Path(path)
     config = config or CalibrateConfig()
-    check_number("calibrate()", "seed", config.seed, _SEEDS)
     check_ranges(config, "calibrate()")
     report = progress or (lambda stage, done, total: None)
     if not path.is_dir():

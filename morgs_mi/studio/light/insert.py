@@ -14,19 +14,20 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 from xml.etree import ElementTree
 
 import cv2
 import mitsuba as mi
 import numpy as np
+from annotated_types import Ge
 
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, bounded, check_number
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.core.color_space import decode_light, encode_light
+from morgs_mi.core.config import check_ranges
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.ranges import check_ranges
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import available_channels
@@ -50,7 +51,7 @@ Build = Callable[[int, float], dict[str, Any]]
 class InsertConfig:
     """Rendering of an inserted scene."""
 
-    samples: int = 16
+    samples: Annotated[int, Ge(1)] = 16
     """Samples per pixel of its surfaces."""
     shadows: bool = True
     """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
@@ -62,7 +63,6 @@ class InsertConfig:
     stream of an HDR recording, which is not clipped."""
 
     def __post_init__(self) -> None:
-        check_number("render_inserted()", "samples", self.samples, "[1, inf)")
         check_ranges(self, "render_inserted()")
 
 

@@ -23,17 +23,18 @@ from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
+from annotated_types import Ge
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
 
-from morgs_mi.core.ranges import AtLeast, check_value
+from morgs_mi.core.config import check_value
 from morgs_mi.core.types import Bool, Float, Jit
 from morgs_mi.studio.light.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
 
 _PROPERTIES = {
-    "max_depth": Annotated[int, AtLeast(-1)],
-    "rr_depth": Annotated[int, AtLeast(1)],
-    "clipped": Annotated[float, AtLeast(1)],
+    "max_depth": Annotated[int, Ge(-1)],
+    "rr_depth": Annotated[int, Ge(1)],
+    "clipped": Annotated[float, Ge(1)],
 }
 
 

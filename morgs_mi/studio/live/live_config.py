@@ -6,17 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from morgs_mi.core.checks import check_number
-from morgs_mi.core.ranges import Above, AtLeast, check_ranges
+from annotated_types import Ge, Gt, Le
+
+from morgs_mi.core.config import check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 
 # Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and
 # nothing should move during the first frame.
 LIVE_STREAM = StreamConfig(fit=FitConfig(epochs=2, first_frame_seconds=30.0))
-# Frame rates of streams, and times for which a thread can wait.
-_FPS = "[1e-6, 1e6]"
-_SECONDS = "[0, 1e6]"
 
 
 @dataclass(frozen=True)
@@ -29,21 +27,21 @@ class LiveConfig:
     """
     without: tuple[str, ...] = ()
     """Calibrated cameras that are left out, by name."""
-    downscale: Annotated[float, AtLeast(1)] = 1
+    downscale: Annotated[float, Ge(1)] = 1
     """Factor by which the images are reduced."""
     test_view: tuple[str, ...] = ()
     """Held-out cameras, by indices or names; by default all are fitted."""
-    frames: Annotated[int, AtLeast(1)] | None = None
+    frames: Annotated[int, Ge(1)] | None = None
     """Number of frames to fit; by default as many as come."""
-    seconds: Annotated[float, Above(0)] | None = None
+    seconds: Annotated[float, Gt(0)] | None = None
     """Time in seconds for the frames after the first one; by default until the cameras end."""
     record: bool = True
     """Store the images of all fitted frames; otherwise of the first one alone."""
-    fps: Annotated[float, Above(0)] = 30
+    fps: Annotated[float, Ge(1e-6), Le(1e6)] = 30
     """Frames per second at which the stream is played."""
-    timeout: Annotated[float, Above(0)] = 10
+    timeout: Annotated[float, Gt(0), Le(1e6)] = 10
     """Seconds to wait for a camera before it is left out."""
-    warm_up: Annotated[float, AtLeast(0)] = 1
+    warm_up: Annotated[float, Ge(0), Le(1e6)] = 1
     """Seconds in which the cameras adjust their exposure before the first images are taken; not of
     files.
     """
@@ -67,6 +65,3 @@ class LiveConfig:
                 "(--camera)."
             )
         check_ranges(self, place)
-        check_number(place, "fps", self.fps, _FPS)
-        for name in ("timeout", "warm_up"):
-            check_number(place, name, getattr(self, name), _SECONDS)

@@ -17,12 +17,13 @@ from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Le
 
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import write_json
-from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 
 
 @dataclass(frozen=True)
@@ -32,14 +33,14 @@ class Disturbances:
     The held-out camera is the reference: it has no time offset.
     """
 
-    time_offset: Annotated[float, AtLeast(0)] = 0.0
+    time_offset: Annotated[float, Ge(0)] = 0.0
     """Largest time offset of a camera from cam00 in frames; drawn per camera."""
-    rolling_shutter: Annotated[float, AtLeast(0), AtMost(1)] = 0.0
+    rolling_shutter: Annotated[float, Ge(0), Le(1)] = 0.0
     """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about
     0.5.
     """
     # Beyond, the corners of a wide view fold.
-    distortion: Annotated[float, AtLeast(0), AtMost(0.5)] = 0.0
+    distortion: Annotated[float, Ge(0), Le(0.5)] = 0.0
     """Largest radial distortion of the lenses, COLMAP's SIMPLE_RADIAL k, drawn per camera; 0.1 is
     moderate.
     """

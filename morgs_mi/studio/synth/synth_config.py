@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
-from morgs_mi.core.checks import check_number
+from annotated_types import Ge, Gt, Le, Lt, MultipleOf
+
+from morgs_mi.core.config import check_ranges
 from morgs_mi.core.documentation import documented
-from morgs_mi.core.ranges import Above, AtLeast, Below, MultipleOf, check_ranges
 from morgs_mi.studio.synth.disturbances import Disturbances
 
 if TYPE_CHECKING:
     from morgs_mi.studio.synth.scene import RecordingDefaults
-
-# Frame rates that the encoders of videos take, and numbers of samples that a sampler of Mitsuba
-# takes.
-_FPS = "(0, 1000]"
-_SPP = "[1, 1e6]"
 
 
 @documented
@@ -24,26 +20,28 @@ _SPP = "[1, 1e6]"
 class SynthConfig:
     """Size, length and disturbances of a synthetic capture."""
 
-    cameras: Annotated[int, AtLeast(2)] | None = None
+    cameras: Annotated[int, Ge(2)] | None = None
     """Number of cameras, the held-out cam00 included; the scene's own, usually 10, if not given."""
-    frames: Annotated[int, AtLeast(1)] = 12
+    frames: Annotated[int, Ge(1)] = 12
     """Number of frames per camera."""
-    width: Annotated[int, AtLeast(2), MultipleOf(2)] = 320
+    width: Annotated[int, Ge(2), MultipleOf(2)] = 320
     """Width of the images in pixels, even."""
-    height: Annotated[int, AtLeast(2), MultipleOf(2)] = 240
+    height: Annotated[int, Ge(2), MultipleOf(2)] = 240
     """Height of the images in pixels, even."""
-    spp: Annotated[int, AtLeast(1)] | None = None
+    # A sampler of Mitsuba takes no more.
+    spp: Annotated[int, Ge(1), Le(1e6)] | None = None
     """Samples per pixel; 16 gives noise at 42 dB. The scene's own, usually 16, if not given."""
-    noise: Annotated[float, AtLeast(0), Below(1)] | None = None
+    noise: Annotated[float, Ge(0), Lt(1)] | None = None
     """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey
     levels. The scene's own, usually 0, if not given."""
-    fps: Annotated[float, Above(0)] = 30.0
+    # The encoders of videos take no more.
+    fps: Annotated[float, Gt(0), Le(1000)] = 30.0
     """Frames per second."""
     lossless: bool = True
     """Also write the frames as PNG files, which are read in place of the compressed videos."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     """Disturbances of the recording."""
-    seed: Annotated[int, AtLeast(0)] = 0
+    seed: Annotated[int, Ge(0)] = 0
     """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the
     scene random.
     """
@@ -55,9 +53,6 @@ class SynthConfig:
             ValueError: they are not.
         """
         check_ranges(self, "synthesize()")
-        check_number("synthesize()", "fps", self.fps, _FPS)
-        if self.spp is not None:
-            check_number("synthesize()", "spp", self.spp, _SPP)
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings, with the scene's own values for missing ones."""
