@@ -9,13 +9,11 @@ import re
 import shutil
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from errno import ENOLCK, ENOTSUP
 from pathlib import Path
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # Windows, where folders are not locked
-    fcntl = None
+from filelock import FileLock, Timeout
 
 _LOCK = ".morgs-lock"
 
@@ -101,20 +99,18 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         undo.callback(_remove_empty, new_folders)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileExistsError:
-            raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
-        except OSError as error:
-            raise write_error(f"{place}: cannot write into {path}", error, folder) from error
-        undo.callback(os.close, lock)
-        # A writer that has just ended may have removed the file between its opening and its
-        # locking.
-        if not _locked(lock) or not is_same_file(file, os.fstat(lock)):
+            undo.enter_context(FileLock(file, blocking=False))
+        except Timeout:
             raise BlockingIOError(
                 f"{path}: expected a folder into which nothing else is written, got one into which "
                 "another process is writing; wait until it has ended, or choose another folder."
-            )
-        undo.callback(_remove_own, file, lock)
+            ) from None
+        except FileExistsError:
+            raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
+        except OSError as error:
+            if error.errno not in (ENOLCK, ENOTSUP):
+                raise write_error(f"{place}: cannot write into {path}", error, folder) from error
+        undo.callback(_remove_own, file, file.stat())
         yield
 
 
@@ -163,23 +159,9 @@ def write_error(start: str, error: Exception, target: Path) -> OSError:
     return failure
 
 
-def _locked(file: int) -> bool:
-    """Lock an open file and return whether that succeeded; it fails if another process holds the
-    lock.
-    """
-    try:
-        if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        pass
-    return True
-
-
-def _remove_own(file: Path, lock: int) -> None:
+def _remove_own(file: Path, status: os.stat_result) -> None:
     """Remove a lock file unless another writer has replaced it."""
-    if is_same_file(file, os.fstat(lock)):
+    if is_same_file(file, status):
         _remove(file)
 
 
