@@ -8,7 +8,7 @@ registers itself where it is imported.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pkgutil import resolve_name
 from typing import Any
 
@@ -51,3 +51,8 @@ def place_of(registry: str, name: str) -> str:
 def studio_entry(registry: str, name: str) -> Any:
     """Return the class, function or module that the studio adds to a registry under a name."""
     return resolve_name(place_of(registry, name))
+
+
+def studio_function(registry: str, name: str) -> Callable[..., Any]:
+    """Return the function of an entry, which is imported when it is called."""
+    return lambda *arguments: studio_entry(registry, name)(*arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Generic, TypeVar
 
 Made = TypeVar("Made")
@@ -25,6 +26,7 @@ class Registry(Generic[Made, Config]):
         self._setting = setting
         self._factories: dict[str, Callable[[str, Config], Made]] = {}
         self._arguments: dict[str, str] = {}
+        self._cached = lru_cache(maxsize=8)(self._make)
 
     def register(
         self, name: str, argument: str = ""
@@ -39,7 +41,10 @@ class Registry(Generic[Made, Config]):
         Raises:
             ValueError: the name is empty, has a colon or is taken.
         """
-        self._check_new(name)
+        if not name or ":" in name or name in self._factories:
+            raise ValueError(
+                f"register(): `name` must be a new name without a colon, got {name!r}; rename one."
+            )
 
         def add(factory: Callable[[str, Config], Made]) -> Callable[[str, Config], Made]:
             self._factories[name] = factory
@@ -48,48 +53,25 @@ class Registry(Generic[Made, Config]):
 
         return add
 
-    def _check_new(self, name: str) -> None:
-        """Raise an error unless a method can be registered by this name."""
-        if not name or ":" in name:
-            raise ValueError(f"register(): `name` must be a name without a colon, got {name!r}.")
-        if name in self._factories:
-            raise ValueError(
-                f"register(): `name` must be new, got {name!r}, which is registered already; "
-                "rename one."
-            )
-
-    def register_entry(
-        self, name: str, argument: str, entry: Callable[[], Callable[[str, Config], Made]]
-    ) -> None:
-        """Register a factory that is imported when it is used.
-
-        Args:
-            name: as for `register`.
-            argument: as for `register`.
-            entry: returns the factory.
-        """
-        self.register(name, argument)(lambda text, config: entry()(text, config))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names that take no argument, in the order of their registration."""
-        return tuple(name for name, argument in self._arguments.items() if not argument)
-
     @property
     def usages(self) -> tuple[str, ...]:
         """Values of the setting: names without an argument, then NAME:ARGUMENT of the others."""
-        return (
-            *self.names,
-            *(f"{name}:{argument}" for name, argument in self._arguments.items() if argument),
+        usages = [f"{name}:{argument}" for name, argument in self._arguments.items()]
+        return tuple(
+            usage.removesuffix(":") for usage in sorted(usages, key=lambda usage: usage[-1] != ":")
         )
 
     def make(self, text: str, config: Config) -> Made:
-        """Return the implementation that `text` selects.
+        """Return the implementation that `text` selects; the last few are cached, so a network is
+        loaded once.
 
         Raises:
             ValueError: `text` selects none, or as its factory.
         """
         self.check(text)
+        return self._cached(text, config)
+
+    def _make(self, text: str, config: Config) -> Made:
         name, _, argument = text.partition(":")
         return self._factories[name](argument, config)
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -242,7 +241,6 @@ def _weight(text: str) -> float:
     return weight
 
 
-@cache
 def _terms_of(config: ObjectiveConfig) -> tuple[Term, ...]:
     """Return all terms that the settings have a weight for."""
     return (*TERMS, *(LOSS_TERMS.make(text, config) for text in config.terms))

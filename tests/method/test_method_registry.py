@@ -30,8 +30,13 @@ def test_registry__makes_what_a_string_selects(registry):
     assert registry.make("file:a:b.png", 3) == "file a:b.png 3"
 
 
+def test_registry__makes_the_same_once(registry):
+    registry.register("new")(lambda argument, config: object())
+    assert registry.make("new", 1) is registry.make("new", 1)
+    assert registry.make("new", 1) is not registry.make("new", 2)
+
+
 def test_registry__lists_names_without_argument_first(registry):
-    assert registry.names == ("round",)
     assert registry.usages == ("round", "file:PATH")
 
 
@@ -44,7 +49,7 @@ def test_registry__rejects_other_strings_with_the_known_ones(registry, text):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("", "got ''"), ("a:b", "got 'a:b'"), ("round", "is registered already")]
+    ("name", "message"), [("", "got ''"), ("a:b", "got 'a:b'"), ("round", "got 'round'")]
 )
 def test_registry__rejects_bad_and_taken_names(registry, name, message):
     with pytest.raises(ValueError, match=message):

@@ -4,14 +4,13 @@ Every module of this package is imported here. A new one only has to register it
 `flow_registry`).
 """
 
-from functools import partial
 from importlib import import_module
 from pkgutil import iter_modules
 
-from morgs_mi.core.entries import STUDIO, studio_entry
+from morgs_mi.core.entries import STUDIO, studio_function
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 for _name in STUDIO["flow sources"]:
-    FLOW_SOURCES.register_entry(_name, "FILE", partial(studio_entry, "flow sources", _name))
+    FLOW_SOURCES.register(_name, "FILE")(studio_function("flow sources", _name))

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -45,8 +44,6 @@ FLOW_SOURCES: Registry[FlowSource, FlowConfig] = Registry("flow_source()", "flow
 def flow_source(flow_method: str, config: FlowConfig | None = None) -> FlowSource:
     """Return the flow source that a string selects.
 
-    The last few sources are cached, so a network is loaded once.
-
     Args:
         flow_method: one of `FLOW_SOURCES.usages`: a key of `FLOW_METHODS`; ``files:FOLDER`` (see
             `files`); ``onnx:FILE`` (see `network`) for a network that takes values from 0 to 255,
@@ -58,12 +55,7 @@ def flow_source(flow_method: str, config: FlowConfig | None = None) -> FlowSourc
         FileNotFoundError: the folder or file is missing.
         ValueError: the string selects no source, or as `FlowNetwork`.
     """
-    return _flow_source(flow_method, config or FlowConfig())
-
-
-@lru_cache(maxsize=8)
-def _flow_source(flow_method: str, config: FlowConfig) -> FlowSource:
-    return FLOW_SOURCES.make(flow_method, config)
+    return FLOW_SOURCES.make(flow_method, config or FlowConfig())
 
 
 def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> FlowSource:

@@ -11,7 +11,6 @@ it is imported.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 
@@ -26,8 +25,6 @@ MASK_REFINERS: Registry[MaskRefiner, MaskConfig] = Registry("mask_refiner()", "m
 def mask_refiner(mask_method: str, config: MaskConfig | None = None) -> MaskRefiner:
     """Return the mask refiner that a string selects.
 
-    The last few refiners are cached, so a network is loaded once.
-
     Args:
         mask_method: one of `MASK_REFINERS.usages`, e.g. ``grabcut`` (see `opencv_masks`) or
             ``sam2:ENCODER.onnx,DECODER.onnx`` (see `network`).
@@ -37,12 +34,7 @@ def mask_refiner(mask_method: str, config: MaskConfig | None = None) -> MaskRefi
         FileNotFoundError: a file is missing.
         ValueError: the string selects no refiner, or as `SegmentNetwork`.
     """
-    return _mask_refiner(mask_method, config or MaskConfig())
-
-
-@lru_cache(maxsize=8)
-def _mask_refiner(mask_method: str, config: MaskConfig) -> MaskRefiner:
-    return MASK_REFINERS.make(mask_method, config)
+    return MASK_REFINERS.make(mask_method, config or MaskConfig())
 
 
 @MASK_REFINERS.register("none")
