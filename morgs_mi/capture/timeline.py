@@ -110,8 +110,6 @@ def timeline(
             camera or has an offset that is not finite.
     """
     check_names(path, "offset", config.offset, names)
-    for name, offset in config.offset.items():
-        check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
     numbers = align_numbers(path, names, readers, config.trim, config.offset)
     for note in numbers.notes:
         _LOG.warning("%s: %s", path, note)

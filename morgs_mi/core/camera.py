@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.checks import LARGEST, bounded, check_number, check_size, numbers
+from morgs_mi.core.checks import LARGEST, bounded, check_number, check_size, numbers, require
 from morgs_mi.core.types import Tensor
 
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
@@ -67,31 +67,27 @@ class Camera:
         check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
         for name in ("delay", "readout"):
             check_number(where, name, getattr(self, name), "[-1, 1]")
-        K = numbers(where, "K", self.K).astype(np.float64)
-        if K.shape != (3, 3):
-            raise ValueError(
-                f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics."
-            )
+        K = numbers(where, "K", self.K, 3, 3).astype(np.float64)
+        require(
+            bounded(K) and K[0, 0] > 0 and K[1, 1] > 0,
+            where,
+            "`K` must be finite with positive focal lengths",
+            K.tolist(),
+            "check the calibration",
+        )
+        require(
+            not (K[0, 1] or K[1, 0]) and np.array_equal(K[2], (0, 0, 1)),
+            where,
+            "`K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            K.tolist(),
+            "resample the images to a camera without skew",
+        )
         viewmat = self.viewmat
-        if not isinstance(viewmat, dr.ArrayBase):
-            viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
-        if tuple(viewmat.shape) != (4, 4):
-            raise ValueError(
-                f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one "
-                "world-to-camera matrix."
-            )
-        if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
-            raise ValueError(
-                f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; "
-                "check the calibration."
-            )
-        if isinstance(viewmat, np.ndarray):
-            viewmat = rigid(f"{where}, `viewmat`", viewmat)
-        if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
-            raise ValueError(
-                f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
-                "resample the images to a camera without skew."
-            )
+        if isinstance(viewmat, dr.ArrayBase):
+            shape = tuple(viewmat.shape)
+            require(shape == (4, 4), where, "`viewmat` must be [4, 4]", shape, "pass one camera's")
+        else:
+            viewmat = rigid(f"{where}, `viewmat`", numbers(where, "viewmat", viewmat, 4, 4))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
 
@@ -125,23 +121,20 @@ class Camera:
         where = "Camera.look_at()"
         check_size(where, width, height)
         check_number(where, "fov_x", fov_x, "(0, 180)")
-        vectors: list[np.ndarray] = []
-        for key, value in (("origin", origin), ("target", target), ("up", up)):
-            vector = numbers(where, key, value).astype(np.float64)
-            if vector.shape != (3,):
-                raise ValueError(
-                    f"{where}: `{key}` must be [3], got {list(vector.shape)}; pass x, y and z."
-                )
-            vectors.append(vector)
-        origin, target, up = vectors
+        named_vectors = {"origin": origin, "target": target, "up": up}
+        origin, target, up = (
+            numbers(where, key, value, 3).astype(np.float64) for key, value in named_vectors.items()
+        )
         forward = target - origin
         right = np.cross(forward, up)
         distance = np.linalg.norm(forward)
-        if not np.linalg.norm(right) > 1e-12 * (distance * np.linalg.norm(up)):
-            raise ValueError(
-                f"{where}: `up` must not be parallel to the direction of view, got origin "
-                f"{origin.tolist()}, target {target.tolist()}, up {up.tolist()}; tilt it."
-            )
+        require(
+            np.linalg.norm(right) > 1e-12 * (distance * np.linalg.norm(up)),
+            where,
+            "`up` must not be parallel to the direction of view",
+            f"origin {origin.tolist()}, target {target.tolist()}, up {up.tolist()}",
+            "tilt it",
+        )
         forward = forward / distance
         right = right / np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
@@ -163,11 +156,13 @@ class Camera:
 
         is_sensor = isinstance(sensor, mi.Sensor)
         kind = sensor.class_name() if is_sensor else f"a {type(sensor).__name__}"
-        if kind != "PerspectiveCamera":
-            raise ValueError(
-                f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; "
-                "splats are drawn only by pinhole cameras without lens distortion."
-            )
+        require(
+            kind == "PerspectiveCamera",
+            "Camera.from_sensor()",
+            "`sensor` must be a `perspective` sensor",
+            kind,
+            "splats are drawn only by pinhole cameras without lens distortion",
+        )
         params: Any = mi.traverse(sensor)
         width, height = (int(size) for size in sensor.film().size())
         names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip")
@@ -280,12 +275,14 @@ class Camera:
 
         fx = self.K[0, 0]
         fy = self.K[1, 1]
-        if abs(fx / fy - 1) * self.height > 1:
-            raise ValueError(
-                "Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor "
-                f"has one, got {fx:g} and {fy:g}; render `camera.square()`, of "
-                f"{self.square().width}x{self.square().height} pixels, and resize the image."
-            )
+        require(
+            abs(fx / fy - 1) * self.height <= 1,
+            "Camera.sensor()",
+            "`K` must have equal focal lengths, because Mitsuba's sensor has one",
+            f"{fx:g} and {fy:g}",
+            f"render `camera.square()`, of {self.square().width}x{self.square().height} pixels, "
+            "and resize the image",
+        )
         # Mitsuba adds its offset to the pixel's position, so the principal point moves the other
         # way.
         return {
@@ -326,25 +323,34 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
         ValueError: it is not, in a sentence that begins with `where`.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape not in ((3, 4), (4, 4)):
-        raise ValueError(
-            f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again."
-        )
-    if not bounded(matrix):
-        raise ValueError(
-            f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got "
-            f"{matrix.tolist()}; calibrate again."
-        )
+    require(
+        matrix.shape in ((3, 4), (4, 4)),
+        where,
+        "the pose must be a matrix [4, 4]",
+        matrix.shape,
+        "calibrate again",
+    )
+    require(
+        bounded(matrix),
+        where,
+        f"the pose must be finite, with numbers of at most {LARGEST:g}",
+        matrix.tolist(),
+        "calibrate again",
+    )
     R = matrix[:3, :3]
-    # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise ValueError(
-            f"{where}: the axes must be a right-handed orthonormal frame, got "
-            f"{R.round(4).tolist()}; undo any scaling or mirroring of the poses."
-        )
-    if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
-        raise ValueError(
-            f"{where}: the last row must be [0, 0, 0, 1], got {matrix[3].tolist()}; transpose the "
-            "matrix if its translation is there."
-        )
+    require(
+        # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
+        np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0,
+        where,
+        "the axes must be a right-handed orthonormal frame",
+        R.round(4).tolist(),
+        "undo any scaling or mirroring of the poses",
+    )
+    require(
+        np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6),
+        where,
+        "the last row must be [0, 0, 0, 1]",
+        matrix[3:].tolist(),
+        "transpose the matrix if its translation is there",
+    )
     return np.vstack([matrix[:3], [0, 0, 0, 1.0]])

@@ -17,6 +17,23 @@ def bounded(values: ArrayLike) -> bool:
     return bool((np.abs(values) <= LARGEST).all())
 
 
+def require(holds: Any, place: str, requirement: str, value: Any, remedy: str) -> None:
+    """Raise an error unless a condition holds.
+
+    Args:
+        holds: whether it does.
+        place: where the error's sentence begins, such as a function.
+        requirement: what must be, in words.
+        value: what is instead.
+        remedy: end of the sentence.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if not holds:
+        raise ValueError(f"{place}: {requirement}, got {value}; {remedy}.")
+
+
 def check_number(place: str, name: str, value: Any, interval: str) -> None:
     """Raise an error unless a setting is a number in an interval.
 
@@ -29,18 +46,15 @@ def check_number(place: str, name: str, value: Any, interval: str) -> None:
     Raises:
         ValueError: it is not, which includes NaN.
     """
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if not is_number or not _lies_in(value, interval):
-        raise ValueError(
-            f"{place}: `{name}` must be a number in {interval}, got {value!r}; set another value."
-        )
-
-
-def _lies_in(x: Any, interval: str) -> bool:
-    """Return whether an interval contains a number, also an integer of hundreds of digits."""
     low, high = map(float, interval[1:-1].split(","))
-    above = low <= x if interval[0] == "[" else low < x
-    return above and (x <= high if interval[-1] == "]" else x < high)
+    lies_in = (
+        isinstance(value, Real)
+        and not isinstance(value, bool)
+        and (low <= value if interval[0] == "[" else low < value)
+        and (value <= high if interval[-1] == "]" else value < high)
+    )
+    requirement = f"`{name}` must be a number in {interval}"
+    require(lies_in, place, requirement, repr(value), "set another value")
 
 
 def check_type(
@@ -58,11 +72,8 @@ def check_type(
     Raises:
         ValueError: it is not.
     """
-    if not isinstance(value, kind):
-        expected = f"{kind.__module__}.{kind.__qualname__}"
-        raise ValueError(
-            f"{place}: `{name}` must be a {expected}, got a {type(value).__name__}; {remedy}."
-        )
+    requirement = f"`{name}` must be a {kind.__module__}.{kind.__qualname__}"
+    require(isinstance(value, kind), place, requirement, f"a {type(value).__name__}", remedy)
 
 
 def check_size(place: str, width: Any, height: Any) -> None:
@@ -71,11 +82,13 @@ def check_size(place: str, width: Any, height: Any) -> None:
     Raises:
         ValueError: it is not.
     """
-    if not all(isinstance(v, (int, np.integer)) and v >= 1 for v in (width, height)):
-        raise ValueError(
-            f"{place}: the image size must be at least 1x1 in integers, got {width!r}x{height!r}; "
-            "check width and height."
-        )
+    require(
+        all(isinstance(v, (int, np.integer)) and v >= 1 for v in (width, height)),
+        place,
+        "the image size must be at least 1x1 in integers",
+        f"{width!r}x{height!r}",
+        "check width and height",
+    )
 
 
 def check_mask(place: str, mask: Any, height: int, width: int) -> None:
@@ -84,11 +97,13 @@ def check_mask(place: str, mask: Any, height: int, width: int) -> None:
     Raises:
         ValueError: it is not.
     """
-    if not isinstance(mask, np.ndarray) or mask.shape != (height, width) or mask.dtype != bool:
-        raise ValueError(
-            f"{place}: the mask must be bool [{height}, {width}] like its image, got "
-            f"{kind_of(mask)}; resize it without interpolation, or compare it with a threshold."
-        )
+    require(
+        isinstance(mask, np.ndarray) and mask.shape == (height, width) and mask.dtype == bool,
+        place,
+        f"the mask must be bool [{height}, {width}] like its image",
+        kind_of(mask),
+        "resize it without interpolation, or compare it with a threshold",
+    )
 
 
 def kind_of(value: Any) -> str:
@@ -100,21 +115,24 @@ def kind_of(value: Any) -> str:
     )
 
 
-def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
+def numbers(place: str, name: str, values: ArrayLike, *shape: int) -> np.ndarray:
     """Return an argument as a NumPy array, which is not a copy where it is one already.
 
     Raises:
-        ValueError: it is not an array of real numbers.
+        ValueError: it is not an array of real numbers, or not of this shape, if one is given.
     """
     try:
         array = np.asarray(values)
     except (TypeError, ValueError, RuntimeError):  # for instance rows of different lengths
         array = np.array(None)
-    if array.dtype.kind not in "fiub":
-        kind = kind_of(values) if isinstance(values, np.ndarray) else repr(values)[:80]
-        raise ValueError(
-            f"{place}: `{name}` must be an array of real numbers, got {kind}; convert it to floats."
-        )
+    is_array = isinstance(values, np.ndarray) or array.dtype.kind in "fiub"
+    require(
+        array.dtype.kind in "fiub" and (not shape or array.shape == shape),
+        place,
+        f"`{name}` must be an array of real numbers {list(shape) or ''}".rstrip(),
+        kind_of(array) if is_array else repr(values)[:80],
+        "convert it to floats of that shape" if shape else "convert it to floats",
+    )
     return array
 
 
@@ -131,28 +149,27 @@ def check_points(
     colors = numbers(place, "point_colors", colors)
     if not points.size and not colors.size:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(
-            f"{place}: `points` must be [P, 3], got {list(points.shape)}; pass one row for each "
-            "point."
-        )
-    if colors.shape != points.shape:
-        raise ValueError(
-            f"{place}: `point_colors` must be {list(points.shape)} like `points`, got "
-            f"{list(colors.shape)}; pass one colour for each point."
-        )
-    requirement = f"`points` must be finite and at most {LARGEST:g}"
-    _check_rows(place, requirement, points, np.abs(points) <= LARGEST, "remove this point")
-    requirement = f"`point_colors` must be in [0, {most:g}]"
-    is_color = (colors >= 0) & (colors <= most)
-    _check_rows(place, requirement, colors, is_color, "divide colours of 8 bits by 255")
+    require(
+        points.ndim == 2 and points.shape[1] == 3 and colors.shape == points.shape,
+        place,
+        "`points` and `point_colors` must be [P, 3]",
+        f"{list(points.shape)} and {list(colors.shape)}",
+        "pass a row and a colour for each point",
+    )
+    for requirement, values, good, remedy in (
+        (
+            f"`points` must be finite and at most {LARGEST:g}",
+            points,
+            np.abs(points) <= LARGEST,
+            "remove this point",
+        ),
+        (
+            f"`point_colors` must be in [0, {most:g}]",
+            colors,
+            (colors >= 0) & (colors <= most),
+            "divide colours of 8 bits by 255",
+        ),
+    ):
+        row = int(np.argmin(good.all(axis=1)))
+        require(good.all(), place, requirement, f"{values[row].tolist()} at {row}", remedy)
     return points, colors
-
-
-def _check_rows(
-    place: str, requirement: str, values: np.ndarray, good: np.ndarray, remedy: str
-) -> None:
-    """Raise an error about the first row of `values` [P, 3] that is not all `good` [P, 3]."""
-    if not good.all():
-        row = np.flatnonzero(~good.all(axis=1))[0]
-        raise ValueError(f"{place}: {requirement}, got {values[row].tolist()} at {row}; {remedy}.")

@@ -121,8 +121,9 @@ def _expected(value: Any, kind: Any) -> str:
     origin = get_origin(kind)
     args = get_args(kind)
     if origin in (Union, UnionType):
-        expected = [_expected(value, arm) for arm in args]
-        return " or ".join(expected) if all(expected) else ""
+        arms = {arm: _expected(value, arm) for arm in args}
+        fits = not all(arms.values())
+        return "" if fits else " or ".join(arms[arm] for arm in args if arm is not NoneType)
     if origin is Annotated:
         bounds = [(*_BOUNDS[type(bound)], *astuple(bound)) for bound in args[1:]]
         words = " and ".join(f"{words} {limit:g}" for words, _, limit in bounds)

@@ -23,7 +23,7 @@ from morgs_mi.core.attributes import (
     SIGMOID,
     sigmoid,
 )
-from morgs_mi.core.checks import numbers
+from morgs_mi.core.checks import numbers, require
 from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Float, Tensor, UInt32
 
@@ -169,27 +169,17 @@ class Gaussians:
             value = getattr(self, f.name)
             if value is not None or f.default is MISSING:
                 object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
-        if len(self.means.shape) != 2:
-            raise ValueError(
-                f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one "
-                "row for each."
-            )
-        N = len(self)
-        for attribute in ATTRIBUTES:
-            if attribute.activated_name == "sh_coeffs":
-                continue  # two rows in one tensor, checked below
-            value = getattr(self, attribute.name)
-            if value is not None and tuple(value.shape) != (N, *attribute.shape):
-                expected = ", ".join(["N", *map(str, attribute.shape)])
-                raise ValueError(
-                    f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got "
-                    f"{tuple(value.shape)}; all attributes describe the same Gaussians."
-                )
-        shape = tuple(self.sh_coeffs.shape)
-        if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
-            raise ValueError(
-                f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got "
-                f"{shape}; K is (degree + 1)^2 for degree 0 to 3."
+        N = self.means.shape[0] if len(self.means.shape) else 0
+        shapes = {a.name: [(N, *a.shape)] for a in ATTRIBUTES if a.activated_name != "sh_coeffs"}
+        shapes["sh_coeffs"] = [(N, K, 3) for K in (1, 4, 9, 16)]
+        for name, allowed in shapes.items():
+            value = getattr(self, name)
+            require(
+                value is None or tuple(value.shape) in allowed,
+                "Gaussians()",
+                f"`{name}` must be {' or '.join(str(list(shape)) for shape in allowed)}",
+                () if value is None else list(value.shape),
+                "all attributes describe the same Gaussians",
             )
 
     def __len__(self) -> int:
@@ -226,8 +216,15 @@ class Gaussians:
         place = "Gaussians.from_activated()"
         opacities = numbers(place, "opacities", opacities)
         scales = numbers(place, "scales", scales)
-        _check_activated(f"{place}: `scales` must be at least 0", scales, np.inf)
-        _check_activated(f"{place}: `opacities` must be in [0, 1]", opacities, 1)
+        for name, values, high in (("scales", scales, np.inf), ("opacities", opacities, 1)):
+            bad = np.argwhere((values < 0) | (values > high))
+            require(
+                not len(bad),
+                place,
+                f"`{name}` must be in [0, {high}]",
+                f"{values[tuple(bad[0])]} at {bad[0].tolist()}" if len(bad) else "",
+                "pass activated values, not logarithms or logits",
+            )
         return cls(means, EXP.inverse(scales), quats, SIGMOID.inverse(opacities), sh_coeffs, **more)
 
     @property
@@ -319,30 +316,16 @@ class Gaussians:
         Raises:
             ValueError: there are no parts, or they have different attributes.
         """
-        if not parts:
-            raise ValueError(
-                "Gaussians.concatenate(): `parts` must hold at least one, got none; pass some "
-                "Gaussians."
-            )
         columns = [part.numpy() for part in parts]
-        if any(column.keys() != columns[0].keys() for column in columns):
-            raise ValueError(
-                "Gaussians.concatenate(): all parts must have the same attributes, got "
-                f"{[sorted(column) for column in columns]}; drop or add `motion`, `offset` and "
-                "`logit_confidence`."
-            )
+        require(
+            len({tuple(column) for column in columns}) == 1,
+            "Gaussians.concatenate()",
+            "`parts` must hold at least one, all with the same attributes",
+            [sorted(column) for column in columns],
+            "drop or add `motion`, `offset` and `logit_confidence`",
+        )
         return Gaussians(
             **{k: np.concatenate([column[k] for column in columns]) for k in columns[0]}
-        )
-
-
-def _check_activated(requirement: str, values: np.ndarray, high: float) -> None:
-    """Raise an error about the first value that is not in [0, high]."""
-    bad = np.argwhere((values < 0) | (values > high))
-    if len(bad):
-        raise ValueError(
-            f"{requirement}, got {values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated "
-            "values, not logarithms or logits."
         )
 
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.checks import numbers
+from morgs_mi.core.checks import numbers, require
 from morgs_mi.core.types import Jit, Tensor
 
 try:
@@ -61,12 +61,13 @@ def float_tensor(place: str, name: str, values: ArrayLike | Tensor) -> Tensor:
     """
     if isinstance(values, mi.TensorXf):
         return values
-    if dr.is_array_v(values):
-        raise ValueError(
-            f"{place}: `{name}` must be a NumPy array or a {mi.TensorXf.__module__}.TensorXf, got "
-            f"a {type(values).__module__}.{type(values).__name__}; convert it with "
-            "mi.TensorXf(array, shape)."
-        )
+    require(
+        not dr.is_array_v(values),
+        place,
+        f"`{name}` must be a NumPy array or a {mi.TensorXf.__module__}.TensorXf",
+        f"a {type(values).__module__}.{type(values).__name__}",
+        "convert it with mi.TensorXf(array, shape)",
+    )
     return from_numpy(mi.TensorXf, numbers(place, name, values))
 
 
@@ -79,12 +80,14 @@ def refuse_freezing(place: str) -> None:
     Raises:
         ValueError: it does.
     """
-    if dr.flag(dr.JitFlag.FreezingScope):
-        raise ValueError(
-            f"{place}: expected a call outside dr.freeze, got one inside, which Dr.Jit cannot "
-            "record; call it before the frozen function and pass its result. The renderer "
-            "records its own kernels."
-        )
+    require(
+        not dr.flag(dr.JitFlag.FreezingScope),
+        place,
+        "expected a call outside dr.freeze",
+        "one inside, which Dr.Jit cannot record",
+        "call it before the frozen function and pass its result. The renderer records its own "
+        "kernels",
+    )
 
 
 def owned_copy(values: Jit) -> Jit:
@@ -114,11 +117,13 @@ def check_memory(place: str, needed: float, content: str, remedy: str) -> None:
         ValueError: fewer bytes are free.
     """
     free = free_memory()
-    if needed > free:
-        raise ValueError(
-            f"{place}: expected what fits in the {max(free, 0) / 1e9:.1f} GB of free memory, got "
-            f"{content}, which takes about {needed / 1e9:.1f} GB; {remedy}."
-        )
+    require(
+        needed <= free,
+        place,
+        f"expected what fits in the {max(free, 0) / 1e9:.1f} GB of free memory",
+        f"{content}, which takes about {needed / 1e9:.1f} GB",
+        remedy,
+    )
 
 
 def free_memory() -> float:

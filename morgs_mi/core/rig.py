@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
 
 # Rows and columns of the points of each view.
 _GRID = 16
@@ -159,12 +160,13 @@ def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray)
         ValueError: they are, in a sentence that begins with `where`.
     """
     depths = scene_depths([replace(camera, near=_IN_FRONT) for camera in cameras], points)
-    if all(camera.near > depth for camera, depth in zip(cameras, depths, strict=True)):
-        raise ValueError(
-            f"{where}: the near planes of `cameras` must be in front of the scene, got "
-            f"{cameras[0].near:g} world units where it is {depths[0]:.3g} away; pass "
-            "with_near_planes(cameras, points), or cameras with a smaller `near`."
-        )
+    require(
+        any(camera.near <= depth for camera, depth in zip(cameras, depths, strict=True)),
+        where,
+        "the near planes of `cameras` must be in front of the scene",
+        f"{cameras[0].near:g} world units where it is {depths[0]:.3g} away",
+        "pass with_near_planes(cameras, points), or cameras with a smaller `near`",
+    )
 
 
 def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:

@@ -139,12 +139,12 @@ def test_camera__copies_its_matrices():
         ({"readout": np.nan}, r"`readout` must be a number in \[-1, 1\], got nan"),
         ({"width": 8.5}, "at least 1x1 in integers, got 8.5x16"),
         ({"height": 0}, "at least 1x1 in integers, got 32x0"),
-        ({"K": "K"}, "`K` must be an array of real numbers, got 'K'"),
-        ({"K": np.eye(2)}, r"`K` must be \[3, 3\]"),
+        ({"K": "K"}, r"`K` must be an array of real numbers \[3, 3\], got 'K'"),
+        ({"K": np.eye(2)}, r"`K` must be an array of real numbers \[3, 3\]"),
         ({"K": K + np.eye(3, k=1)}, "a camera without skew"),
         ({"K": -K}, "positive focal lengths"),
-        ({"viewmat": None}, "`viewmat` must be an array of real numbers, got None"),
-        ({"viewmat": VIEWMAT[:3]}, r"`viewmat` must be \[4, 4\]"),
+        ({"viewmat": None}, r"`viewmat` must be an array of real numbers \[4, 4\], got None"),
+        ({"viewmat": VIEWMAT[:3]}, r"`viewmat` must be an array of real numbers \[4, 4\]"),
         ({"viewmat": VIEWMAT * np.nan}, r"Camera\(\), `viewmat`: the pose must be finite"),
         (
             {"viewmat": np.diag([1, 1, 1, 1e308])},
@@ -171,7 +171,7 @@ def test_camera__refuses_bad_input(change, message):
     [
         ({"target": (0, -3, 0)}, "`up` must not be parallel"),
         ({"up": (0, 1, 0)}, "`up` must not be parallel"),
-        ({"origin": (0, 0)}, r"`origin` must be \[3\], got \[2\]"),
+        ({"origin": (0, 0)}, r"`origin` must be an array of real numbers \[3\], got int64 \[2\]"),
         ({"fov_x": 180}, r"`fov_x` must be a number in \(0, 180\), got 180"),
     ],
 )
