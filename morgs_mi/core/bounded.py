@@ -17,23 +17,26 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from morgs_mi.core.checks import require
+
 _FACTOR = 10
 _ALLOWANCE = 200_000_000
-# Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
+# Errors of parsers for broken files. NumPy parses headers as Python.
 _BROKEN = (
     ValueError,
     TypeError,
     EOFError,
     KeyError,
     MemoryError,
-    RuntimeError,
+    RuntimeError,  # also of too deep a recursion
     OverflowError,
     SyntaxError,
     zipfile.BadZipFile,
@@ -59,11 +62,13 @@ def check_claim(path: str | Path, claimed: int, content: str) -> None:
         ValueError: it takes more.
     """
     size = Path(path).stat().st_size
-    if claimed > _FACTOR * size + _ALLOWANCE:
-        raise ValueError(
-            f"{path}: expected content that fits its {size} bytes, got a claim of {content}, "
-            f"which takes {claimed / 1e6:.0f} MB; the file is broken, create it again."
-        )
+    require(
+        claimed <= _FACTOR * size + _ALLOWANCE,
+        str(path),
+        f"expected content that fits its {size} bytes",
+        f"a claim of {content}, which takes {claimed / 1e6:.0f} MB",
+        "the file is broken, create it again",
+    )
 
 
 def regular(path: str | Path) -> Path:
@@ -73,8 +78,8 @@ def regular(path: str | Path) -> Path:
         ValueError: it is a folder, a pipe or a device.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: expected a file, got a folder, a pipe or a device; remove it.")
+    is_other = path.exists() and not path.is_file()
+    require(not is_other, str(path), "expected a file", "a folder, a pipe or a device", "remove it")
     return path
 
 
@@ -93,8 +98,9 @@ def open_regular(path: str | Path, follow: bool = True) -> BinaryIO:
     # Opening a pipe would wait for its writer.
     extra = getattr(os, "O_NONBLOCK", 0)
     if not follow:
-        if os.path.islink(path):  # Windows has no such flag
-            raise ValueError(f"{path}: expected a file, got a link; open the file that it names.")
+        # Windows has no such flag.
+        is_link = os.path.islink(path)
+        require(not is_link, str(path), "expected a file", "a link", "open the file that it names")
         extra |= getattr(os, "O_NOFOLLOW", 0)
     file = open(  # noqa: SIM115 (the caller closes it)
         path, "rb", opener=lambda name, flags: os.open(name, flags | extra)
@@ -105,23 +111,20 @@ def open_regular(path: str | Path, follow: bool = True) -> BinaryIO:
     return file
 
 
-def read_bytes(path: str | Path, most: int | None = None) -> bytes:
+def read_bytes(path: str | Path, most: float = math.inf) -> bytes:
     """Return the content of a regular file.
 
     Raises:
         OSError: there is no such file, or it cannot be read.
         ValueError: it is no regular file, or has more bytes than `most`.
     """
-    path = regular(path)
-    if most is not None and path.stat().st_size > most:
-        raise ValueError(
-            f"{path}: expected at most {most} bytes, got {path.stat().st_size}; leave out what is "
-            "not needed."
-        )
-    return path.read_bytes()
+    size = regular(path).stat().st_size
+    remedy = "leave out what is not needed"
+    require(size <= most, str(path), f"expected at most {most} bytes", size, remedy)
+    return Path(path).read_bytes()
 
 
-def read_text(path: str | Path, most: int | None = None) -> str:
+def read_text(path: str | Path, most: float = math.inf) -> str:
     """Return the text in a file, without a byte order mark; `most` as for `read_bytes`.
 
     Raises:
@@ -129,12 +132,8 @@ def read_text(path: str | Path, most: int | None = None) -> str:
         ValueError: as for `read_bytes`, or the file is no text.
     """
     data = read_bytes(path, most)
-    try:
+    with _refusing(path, "text in UTF-8", "save it as UTF-8"):
         return data.decode("utf-8-sig")
-    except UnicodeError as error:
-        raise ValueError(
-            f"{path}: expected text in UTF-8, got other bytes ({error}); save it as UTF-8."
-        ) from None
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -144,7 +143,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         OSError: there is no such file, or it cannot be read.
         ValueError: the file is broken, too large or nested too deeply.
     """
-    return _parsed(path, MAX_TOML, "TOML", tomllib.loads)
+    text = read_text(path, MAX_TOML)
+    with _refusing(path, "TOML", "write it again"):
+        return tomllib.loads(text)
 
 
 def read_json(path: str | Path) -> Any:
@@ -154,30 +155,19 @@ def read_json(path: str | Path) -> Any:
         OSError: there is no such file, or it cannot be read.
         ValueError: it is no regular file, is broken, too large or nested too deeply.
     """
-    return _parsed(path, MAX_JSON, "JSON", json.loads)
-
-
-def _parsed(path: str | Path, most: int, language: str, parse: Callable[[str], Any]) -> Any:
-    """Return the result of a parser for a text file, whose errors are raised as errors of the
-    file.
-    """
-    text = read_text(path, most)
-    try:
-        return parse(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"{path}: expected {language}, got a broken file ({error}); write it again."
-        ) from None
+    text = read_text(path, MAX_JSON)
+    with _refusing(path, "JSON", "write it again"):
+        return json.loads(text)
 
 
 def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
-    """Return the array in a NumPy file, or the array `name` in an archive (.npz); it is not
-    writable.
+    """Return the array in a NumPy file, or the array `name` in an archive (.npz).
 
     Raises:
         ValueError: the file is broken, claims more numbers than it holds, or holds Python objects.
     """
-    try:
+    what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
+    with _refusing(path, what, "export it again"):
         if name is None:
             data = read_bytes(path)
         else:
@@ -191,21 +181,14 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
             if np.lib.format.read_magic(stream) == (1, 0)
             else np.lib.format.read_array_header_2_0
         )
-        shape, in_columns, dtype = read_header(stream)
-        # NumPy would execute what such a file contains.
-        if dtype.hasobject:
-            raise ValueError("it holds Python objects, not numbers")
-        count = math.prod(shape)
-        num_bytes = len(data) - stream.tell()
-        if min(shape, default=0) < 0 or count * dtype.itemsize != num_bytes:
-            raise ValueError(f"its header claims {dtype} {shape}, but {num_bytes} bytes follow")
-        flat = np.frombuffer(data, dtype, count, stream.tell())
-        return flat.reshape(shape, order="F" if in_columns else "C")
-    except _BROKEN as error:
-        what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
-        raise ValueError(
-            f"{path}: expected {what}, got a broken file ({error}); export it again."
-        ) from None
+        shape, _, dtype = read_header(stream)
+        if math.prod(shape) * dtype.itemsize > len(data):
+            raise ValueError(f"its header claims {dtype} {shape}, but it has {len(data)} bytes")
+        stream.seek(0)
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+        if array.dtype.kind not in "fiub":
+            raise ValueError(f"it holds {array.dtype}, not numbers")
+        return array
 
 
 def array_names(path: str | Path) -> list[str]:
@@ -214,10 +197,19 @@ def array_names(path: str | Path) -> list[str]:
     Raises:
         ValueError: the file is broken.
     """
+    with (
+        _refusing(path, "a NumPy archive", "export it again"),
+        zipfile.ZipFile(regular(path)) as archive,
+    ):
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
+@contextmanager
+def _refusing(path: str | Path, expected: str, remedy: str) -> Iterator[None]:
+    """Raise the errors of a parser as an error of the file."""
     try:
-        with zipfile.ZipFile(regular(path)) as archive:
-            return [name.removesuffix(".npy") for name in archive.namelist()]
+        yield
     except _BROKEN as error:
         raise ValueError(
-            f"{path}: expected a NumPy archive, got a broken file ({error}); export it again."
+            f"{path}: expected {expected}, got a broken file ({error}); {remedy}."
         ) from None

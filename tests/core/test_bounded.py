@@ -84,10 +84,18 @@ CASES = {
     "npy of many rows": (
         read_array,
         npy("(1000000000000, 17)"),
-        r"claims float64 \(1000000000000, 17\), but 48 bytes",
+        "expected a NumPy array, got a broken file",
     ),
-    "npy of an overflow": (read_array, npy("(9223372036854775807, 17)"), "its header claims"),
-    "npy of negative size": (read_array, npy("(-2, -3)"), r"its header claims float64 \(-2, -3\)"),
+    "npy of an overflow": (
+        read_array,
+        npy("(9223372036854775807, 17)"),
+        "expected a NumPy array, got a broken file",
+    ),
+    "npy of negative size": (
+        read_array,
+        npy("(-2, -3)"),
+        "expected a NumPy array, got a broken file",
+    ),
     "npy of a truth value": (
         read_array,
         npy("(True,)"),
@@ -96,7 +104,7 @@ CASES = {
     "npy of objects": (
         read_array,
         npy("(1,)", "'|O'", b"cos\nsystem\n."),
-        "it holds Python objects, not numbers",
+        "Object arrays cannot be loaded",
     ),
     "npy of no bytes": (
         read_array,
@@ -127,7 +135,7 @@ CASES = {
     "npz of many rows": (
         archived,
         npz(npy("(1000000000, 7)")),
-        r"an array `data` in .* claims float64 \(1000000000, 7",
+        "an array `data` in a NumPy archive, got a broken file",
     ),
     "npz bomb": (archived, npz(bytes(250_000_000)), "got a claim of 250000000 bytes of data.npy"),
     "npz of another name": (
@@ -150,12 +158,12 @@ CASES = {
     "TOML in Latin-1": (
         read_toml,
         "a = 'é'".encode("latin-1"),
-        "expected text in UTF-8, got other bytes",
+        "expected text in UTF-8, got a broken file",
     ),
     "JSON in Latin-1": (
         read_json,
         '"é"'.encode("latin-1"),
-        "expected text in UTF-8, got other bytes",
+        "expected text in UTF-8, got a broken file",
     ),
     "TOML of many rows": (
         read_toml,

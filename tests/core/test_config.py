@@ -242,7 +242,7 @@ def test_apply_values__names_file_key_expected_and_given(
             ValueError,
             r"expected TOML, got a broken file \(Cannot overwrite a value",
         ),
-        (b"\xff", ValueError, r"expected text in UTF-8, got other bytes \('utf-8' codec"),
+        (b"\xff", ValueError, r"expected text in UTF-8, got a broken file \('utf-8' codec"),
     ],
 )
 def test_read_config__names_a_file_that_cannot_be_read(
