@@ -11,15 +11,15 @@ their own: `python -m benchmarks.reports.random_scenes`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import tyro
 
 from benchmarks.reports import codec, method, renderer
 from morgs_mi.cli import Common, run
-from morgs_mi.cli.suggestion import one_command
+from morgs_mi.cli.settings import one_command
 
 SUBJECTS = {"renderer": renderer.Options, "codec": codec.Options, "method": method.Options}
 
@@ -28,7 +28,6 @@ SUBJECTS = {"renderer": renderer.Options, "codec": codec.Options, "method": meth
 class Options(Common):
     """Measure error and run time of a part of the package."""
 
-    commands: ClassVar[Mapping[str, type]] = SUBJECTS
     command: Annotated[Any, one_command(SUBJECTS)] = tyro.MISSING
 
 

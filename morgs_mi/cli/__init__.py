@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from importlib.metadata import version
 from io import TextIOWrapper
 from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import arg
@@ -34,8 +34,7 @@ from morgs_mi.cli.console import (
     print_warning,
     sentence_of,
 )
-from morgs_mi.cli.settings import Flag, Settings
-from morgs_mi.cli.suggestion import one_command, suggesting_command
+from morgs_mi.cli.settings import Flag, Settings, one_command
 from morgs_mi.core.entries import place_of
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
@@ -84,7 +83,6 @@ class Options(Common):
     of a shell.
     """
 
-    commands: ClassVar[Mapping[str, type]] = COMMANDS
     command: Annotated[Any, one_command(COMMANDS)] = tyro.MISSING
 
 
@@ -105,7 +103,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             print_result(f"{prog} {version('morgs-mi')}")
             _flush_output()
             return 0
-        with naming_output(), suggesting_command(options_type, prog, args):  # the help goes there
+        with naming_output():  # the help goes there
             options: Any = tyro.cli(
                 options_type,
                 prog=prog,

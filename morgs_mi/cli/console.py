@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
+    MofNCompleteColumn,
     Progress,
     TaskID,
     TextColumn,
@@ -176,25 +177,19 @@ def progress() -> Iterator[Report]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.fields[count]}/{task.total:.0f}"),
+        MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=ERR) as bars:
-        yield _bar_report(bars)
-
-
-def _bar_report(bars: Progress) -> Report:
-    """Return a function that shows the progress of each stage as a bar."""
     tasks: dict[str, TaskID] = {}
+    with Progress(*columns, console=ERR) as bars:
 
-    def report(stage: str, done: float, total: float) -> None:
-        if stage not in tasks:  # what was done before is not part of its pace
-            tasks[stage] = bars.add_task(stage, count=0)
-            bars.tasks[-1].completed = done
-        bars.update(tasks[stage], completed=done, total=total, count=int(done))
+        def report(stage: str, done: float, total: float) -> None:
+            if stage not in tasks:  # what was done before is not part of its pace
+                tasks[stage] = bars.add_task(stage, completed=int(done))
+            bars.update(tasks[stage], completed=done, total=total)
 
-    return report
+        yield report
 
 
 def _line_report() -> Report:

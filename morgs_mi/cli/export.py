@@ -6,15 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import quantity
-from morgs_mi.cli.export_kind import FRAMES, ExportKind, relative_to
-from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
-from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, place
-from morgs_mi.cli.suggestion import one_command
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_command, optional, place
+from morgs_mi.cli.streams import (
+    FRAMES,
+    DropInvalid,
+    ExportKind,
+    opened,
+    relative_to,
+    shown_exposure,
+)
 from morgs_mi.core.documentation import page
 from morgs_mi.core.entries import studio_entry
 from morgs_mi.core.progress import Report
@@ -150,8 +155,6 @@ class Export:
     kind: Annotated[Any, one_command(EXPORTS)]
 
     drop_invalid: DropInvalid = False
-
-    commands: ClassVar[Mapping[str, type]] = EXPORTS
 
     def run(self) -> None:
         self.kind.run(opened(self.kind.out, self.drop_invalid, self.kind.drawn))

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress, quantity
-from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional
+from morgs_mi.cli.streams import DropInvalid, opened, shown_exposure
 from morgs_mi.core.documentation import page
 from morgs_mi.core.entries import studio_entry
 from morgs_mi.playback.export.formats import IMAGES, destination

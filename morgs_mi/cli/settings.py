@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
+from tyro.conf import DisallowNone, FlagCreatePairsOff, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
@@ -99,27 +101,29 @@ def setting(option: str, config: StreamConfig | None = None, text: str | None = 
     )
 
 
+def one_command(commands: Mapping[str, type]) -> Any:
+    """Return the annotation of an argument that is one of several commands, by their names."""
+    union: Any = reduce(
+        or_, (Annotated[command, subcommand(name)] for name, command in commands.items())
+    )
+    return arg(name="", constructor=union)
+
+
 def _offsets(words: list[str]) -> dict[str, float]:
     """Return the offset of each camera from the words of --offset, a camera and a number in turn.
 
     Raises:
         ValueError: a word is missing, is no number, or names a camera a second time.
     """
-    if not words or len(words) % 2:
-        last = f"{words[-1]!r} without one" if words else "nothing"
-        raise ValueError(
-            f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}."
-        )
     offsets: dict[str, float] = {}
-    for name, number in zip(words[::2], words[1::2], strict=True):
-        if name in offsets:
-            raise ValueError(f"expected each camera once, got {name} twice.")
-        try:
-            offsets[name] = float(number)
-        except ValueError:
-            raise ValueError(
-                f"the offset of {name} must be a number of frames, got {number!r}."
-            ) from None
+    with suppress(ValueError):
+        pairs = zip(words[::2], words[1::2], strict=True)
+        offsets = {name: float(number) for name, number in pairs}
+    if not words or 2 * len(offsets) != len(words):
+        raise ValueError(
+            "expected each camera once, with a number of frames, such as cam01 -0.5, got "
+            f"{' '.join(words) or 'nothing'}."
+        )
     return offsets
 
 
@@ -256,18 +260,16 @@ class Settings:
         from morgs_mi.method.motion_model import motion_model
 
         motion = config.motion
-        checks: dict[str, Callable[[], Any]] = {
-            "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
-            "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
-            "model": lambda: motion_model(motion),
-        }
-        for name, check in checks.items():
-            try:
-                check()
-            except ValueError as error:
-                if self.config is None or f"motion.{name}" in self.given():
-                    raise
-                raise relocated(error, str(self.config), "motion.", [name]) from None
+        try:
+            flow_source(motion.flow_method, motion.flow)
+            mask_refiner(motion.mask_method, motion.masks)
+            motion_model(motion)
+        except ValueError as error:
+            names = {"motion.flow_method", "motion.mask_method", "motion.model"} - {*self.given()}
+            if self.config is None or not names:
+                raise
+            fields = [name.removeprefix("motion.") for name in names]
+            raise relocated(error, str(self.config), "motion.", fields) from None
 
 
 # As fields of a command: options without a prefix. None means "not given", so it cannot be passed.

@@ -9,7 +9,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from morgs_mi.cli.console import print_result
-from morgs_mi.cli.opening import DropInvalid, opened
+from morgs_mi.cli.streams import DropInvalid, opened
 
 
 @dataclass(frozen=True)

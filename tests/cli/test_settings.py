@@ -137,14 +137,11 @@ def test_Reading__has_the_fields_of_the_config() -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["cam01", "abc"], "the offset of cam01 must be a number of frames, got 'abc'."),
-        (
-            ["cam01"],
-            "expected pairs of a camera and a number, such as cam01 -0.5, got 'cam01' without one.",
-        ),
-        (["cam01", "1", "cam02"], "got 'cam02' without one."),
-        (["cam01", "1", "cam01", "2"], "expected each camera once, got cam01 twice."),
-        ([], "expected pairs of a camera and a number, such as cam01 -0.5, got nothing."),
+        (["cam01", "abc"], "such as cam01 -0.5, got cam01 abc."),
+        (["cam01"], "such as cam01 -0.5, got cam01."),
+        (["cam01", "1", "cam02"], "got cam01 1 cam02."),
+        (["cam01", "1", "cam01", "2"], "expected each camera once, with a number of frames"),
+        ([], "such as cam01 -0.5, got nothing."),
     ],
 )
 def test_offset__refuses_what_is_no_pair(

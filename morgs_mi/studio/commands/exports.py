@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import quantity
-from morgs_mi.cli.export_kind import FRAMES, ExportKind, relative_to
 from morgs_mi.cli.settings import Flag, place
+from morgs_mi.cli.streams import FRAMES, ExportKind, relative_to
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import GLTF, USD, Format
 

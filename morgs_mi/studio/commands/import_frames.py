@@ -10,8 +10,8 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.opening import DropInvalid
 from morgs_mi.cli.settings import setting
+from morgs_mi.cli.streams import DropInvalid
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
 

@@ -1,0 +1,93 @@
+"""What the commands that read a stream, or a file of Gaussians, have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from morgs_mi.cli.console import print_result, print_warning, progress
+from morgs_mi.cli.settings import optional
+from morgs_mi.core.progress import Report
+from morgs_mi.playback.export.formats import Format, destination
+
+if TYPE_CHECKING:
+    from morgs_mi.codec.frame_source import FrameSource
+
+_DROP = (
+    "Leave out the Gaussians of a file whose numbers are not finite or absurdly large, however "
+    "many they are."
+)
+DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_hint="")]
+"""Option of the commands that read files of Gaussians."""
+FRAMES = optional(
+    "FRAMES", text="Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."
+)
+
+
+def opened(
+    out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False
+) -> FrameSource:
+    """Return the stream that a command reads, and print which cameras a file of Gaussians has.
+
+    Args:
+        out: folder of a fit, a stream file, or a file of Gaussians.
+        drop_invalid: whether Gaussians with invalid numbers are left out, however many they are.
+        drawn: whether images or pages are made, which are without a few invalid Gaussians in any
+            case; Gaussians that are written for other programs are not.
+        skip_damaged: as for `open_stream`.
+
+    Raises:
+        FileNotFoundError, ValueError: as for `open_stream`.
+    """
+    from morgs_mi.playback.streams import DRAWN, SplatFile, open_stream
+
+    most_invalid = 1.0 if drop_invalid else DRAWN if drawn else 0.0
+    stream = open_stream(out, most_invalid, skip_damaged)
+    if drawn and isinstance(stream, SplatFile) and stream.cameras_file is not None:
+        print_warning(f"Cameras: {stream.cameras_file}.")
+    return stream
+
+
+def shown_exposure(stream: FrameSource, stops: float | None) -> float:
+    """Return the stops by which images of a stream are brightened: the given ones, or where they
+    are None, the stream's.
+    """
+    from morgs_mi.playback.stream_header import stream_exposure
+
+    return stream_exposure(stream) if stops is None else stops
+
+
+def relative_to(stream: FrameSource) -> str:
+    """Return the origin of the centres in files of float32 in words, empty if it is 0."""
+    from morgs_mi.playback.stream_header import stream_origin
+
+    x, y, z = stream_origin(stream)
+    return f", relative to the origin ({x:.10g}, {y:.10g}, {z:.10g})" if x or y or z else ""
+
+
+@dataclass(frozen=True)
+class ExportKind:
+    """A kind of export: options, with `formats` and the method `write` of their writer."""
+
+    out: Positional[Path]
+    """Folder of a fit, a stream file, or a file of Gaussians."""
+
+    formats: ClassVar[tuple[Format, ...]]
+    drawn: ClassVar[bool] = False
+    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames", "least": "--least-seconds"}
+
+    def run(self, stream: FrameSource) -> None:
+        options: Mapping[str, Any] = vars(self)
+        stem = Path(options.get("path", "")).stem
+        output, chosen = destination(stream.path, options["output"], self.formats, stem)
+        with progress() as report:
+            summary = self.write(stream, output, chosen, report)
+        print_result(f"{output}: {summary}.")
+
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        """Write a stream in a format, and return a summary."""
+        raise NotImplementedError
