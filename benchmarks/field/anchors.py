@@ -26,7 +26,6 @@ from scipy.spatial import KDTree
 
 from benchmarks.field.shared import quantised
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.z_order import equal_cells, z_order
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import (
     MOTION_MODELS,
@@ -34,6 +33,7 @@ from morgs_mi.method.motion_model import (
     MotionModelFactory,
     sparse_product,
 )
+from morgs_mi.playback.export.order import equal_cells, z_order
 
 
 @dataclass(frozen=True)

@@ -50,24 +50,13 @@ def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
     turns = Rotation.from_matrix(R) * _rotations(gaussians)
     raw = gaussians.numpy()
     vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
-    coeffs = np.einsum("kl,nlc->nkc", _sh_rotation(R, gaussians.sh_degree), raw["sh_coeffs"])
+    # More than twice as many directions as the 16 functions of degree 3.
+    directions = np.random.default_rng(0).normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis, turned_basis = (sh_basis(d, gaussians.sh_degree) for d in (directions, directions @ R))
+    coeffs = np.einsum("kl,nlc->nkc", np.linalg.pinv(basis) @ turned_basis, raw["sh_coeffs"])
     return replace(gaussians, quats=turns.as_quat(scalar_first=True), sh_coeffs=coeffs, **vectors)
 
 
 def _rotations(gaussians: Gaussians) -> Rotation:
     return Rotation.from_quat(unit_quats(gaussians), scalar_first=True)
-
-
-def _sh_rotation(R: np.ndarray, degree: int) -> np.ndarray:
-    """Return the matrix [K, K] that rotates SH coefficients by R [3, 3]."""
-    # Twice as many directions as the 16 functions of degree 3.
-    directions = _golden_spiral(32)
-    return np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)
-
-
-def _golden_spiral(count: int) -> np.ndarray:
-    """Return evenly spread unit directions [count, 3]."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.pi * (1 + 5**0.5) * np.arange(count)
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -15,10 +16,6 @@ Report = Callable[[str, float, float], None]
 
 _PERIOD = 0.2  # seconds between two updates
 _WIDTH = 30
-_HTML = (
-    '<div>{title} <progress value="{done}" max="{total}" style="width:20em"></progress> '
-    "{text}</div>"
-)
 
 
 @dataclass(frozen=True)
@@ -63,42 +60,41 @@ class ProgressBar:
         self._total = total
         self._stage = ""
         self._begin = time.monotonic()
-        self._shown = -_PERIOD
+        self._shown = -math.inf
         self._output: Any = None
-        self._is_notebook = is_notebook()
 
     def __call__(self, done: float, total: float | None = None) -> None:
         """Show that `done` steps of `total` are done."""
         total = total or self._total
-        seconds = time.monotonic() - self._begin
-        if seconds - self._shown < _PERIOD and done != total:
+        moment = time.monotonic()
+        if moment - self._shown < _PERIOD and done != total:
             return
-        self._shown = seconds
+        self._shown = moment
         share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
-        text = f"{share}, {timedelta(seconds=round(seconds))}"
+        text = f"{share}, {timedelta(seconds=round(moment - self._begin))}"
         name = f"{self._title}: {self._stage}" if self._stage else self._title
-        if self._is_notebook:
+        if is_notebook():
             from IPython.display import HTML, display  # type: ignore[import-not-found]
 
-            value = done if total else 0
             content = HTML(
-                _HTML.format(title=html.escape(name), done=value, total=total or 1, text=text)
+                f'<div>{html.escape(name)} <progress value="{done if total else 0}" '
+                f'max="{total or 1}" style="width:20em"></progress> {text}</div>'
             )
             if self._output is None:
                 self._output = display(content, display_id=True)
             else:
                 self._output.update(content)
         elif sys.stderr.isatty():
-            bar_length = round(_WIDTH * done / total) if total else 0
+            bar = round(_WIDTH * done / total) * "━" if total else ""
             end = "\n" if done == total else ""
-            sys.stderr.write(f"\r{name} {'━' * bar_length:{_WIDTH}} {text}{end}")
+            sys.stderr.write(f"\r{name} {bar:{_WIDTH}} {text}{end}")
             sys.stderr.flush()
 
     def report(self, stage: str, done: float, total: float) -> None:
         """Show that `done` of `total` is done in a stage; for calls that report stages."""
         if stage != self._stage:
             self._begin = time.monotonic()
-            self._shown = -_PERIOD
+            self._shown = -math.inf
             self._stage = stage
         self(done, total)
 
