@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from importlib.metadata import version
 from io import TextIOWrapper
-from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -34,29 +33,31 @@ from morgs_mi.cli.console import (
     print_warning,
     sentence_of,
 )
+from morgs_mi.cli.evaluate import Eval
+from morgs_mi.cli.export import Export
+from morgs_mi.cli.fit import Fit
+from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import Flag, Settings, one_command
-from morgs_mi.core.entries import place_of
+from morgs_mi.cli.view import View
+from morgs_mi.core.entries import studio_entry
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
 # Exit status of a shell for a program whose reader has ended, such as `head`.
 _CLOSED = 141
 # The class of each command, in the order of the help: a dataclass of its options, with `run`.
 COMMANDS: Mapping[str, type] = {
-    name: resolve_name(place)
-    for name, place in {
-        "synth": place_of("commands", "synth"),
-        "info": place_of("commands", "info"),
-        "calibrate": place_of("commands", "calibrate"),
-        "fit": f"{__name__}.fit:Fit",
-        "live": place_of("commands", "live"),
-        "render": f"{__name__}.render:Render",
-        "export": f"{__name__}.export:Export",
-        "import": place_of("commands", "import"),
-        "view": f"{__name__}.view:View",
-        "eval": f"{__name__}.evaluate:Eval",
-        "sweep": place_of("commands", "sweep"),
-        "demo": place_of("commands", "demo"),
-    }.items()
+    "synth": studio_entry("commands", "synth"),
+    "info": studio_entry("commands", "info"),
+    "calibrate": studio_entry("commands", "calibrate"),
+    "fit": Fit,
+    "live": studio_entry("commands", "live"),
+    "render": Render,
+    "export": Export,
+    "import": studio_entry("commands", "import"),
+    "view": View,
+    "eval": Eval,
+    "sweep": studio_entry("commands", "sweep"),
+    "demo": studio_entry("commands", "demo"),
 }
 
 

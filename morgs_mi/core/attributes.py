@@ -60,7 +60,6 @@ class Attribute:
     shape: tuple[int, ...]
     activated_name: str  #: Of the rendered value.
     activation: Activation = IDENTITY  #: Between the two.
-    required: bool = False  #: Whether every `Gaussians` has it.
     #: Field of `LearningRates`, or a learning rate; None where it is not optimised.
     rate: str | float | None = None
     rate_in_extents: bool = False  #: Whether that rate counts in scene extents.
@@ -99,7 +98,6 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         "means",
         (3,),
         "means",
-        required=True,
         rate="means",
         rate_in_extents=True,
         first_frame=True,
@@ -110,7 +108,6 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         (3,),
         "scales",
         EXP,
-        required=True,
         rate="scales",
         gate="appearance",
         first_frame=True,
@@ -120,7 +117,6 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         "quats",
         (4,),
         "quats",
-        required=True,
         rate="quats",
         gate="motion",
         first_frame=True,
@@ -131,7 +127,6 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         (),
         "opacities",
         SIGMOID,
-        required=True,
         rate="opacities",
         gate="appearance",
         first_frame=True,
@@ -141,7 +136,6 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         "sh_dc",
         (1, 3),
         "sh_coeffs",
-        required=True,
         rate="sh_dc",
         gate="appearance",
         first_frame=True,
@@ -151,7 +145,6 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         "sh_rest",
         (-1, 3),
         "sh_coeffs",
-        required=True,
         rate="sh_rest",
         gate="appearance",
         first_frame=True,

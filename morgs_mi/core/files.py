@@ -110,7 +110,8 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         except OSError as error:
             if error.errno not in (ENOLCK, ENOTSUP):
                 raise write_error(f"{place}: cannot write into {path}", error, folder) from error
-        undo.callback(_remove_own, file, file.stat())
+        status = file.stat()
+        undo.callback(lambda: is_same_file(file, status) and _remove(file))
         yield
 
 
@@ -157,12 +158,6 @@ def write_error(start: str, error: Exception, target: Path) -> OSError:
     # Otherwise a folder's sentence would contain the sentence of a file in it.
     failure.strerror = reason
     return failure
-
-
-def _remove_own(file: Path, status: os.stat_result) -> None:
-    """Remove a lock file unless another writer has replaced it."""
-    if is_same_file(file, status):
-        _remove(file)
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
