@@ -118,16 +118,16 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         file = f"{error.filename}: " if error.filename else ""
         message = f"{file}{error.strerror.rstrip('.')}."
+    if isinstance(error, MemoryError) and not message:
+        message = "Out of memory; process smaller images, or fewer frames or Gaussians."
     text = with_option_names(" ".join(message.split()), names, place)
     if not isinstance(error, _EXPECTED):
-        text = (
+        return (
             f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug "
             "for the traceback."
         )
     if isinstance(error, OSError):  # it is about a file; the function is of no use to a user
         text = re.sub(r"^cannot", "Cannot", re.sub(r"^[\w.]+\(\): ", "", text))
-    if isinstance(error, MemoryError):
-        text = text or "Out of memory; process smaller images, or fewer frames or Gaussians."
     return text or f"{type(error).__name__}."
 
 
@@ -144,25 +144,22 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
         names: options by argument name.
         place: a path from the command line that a message may start with; it stays.
     """
-    function = re.match(r"[\w.]+\(\): ", sentence)
-    start = function
-    if start is None and place:
-        # The place, or a file in it that has no such keys.
-        start = re.match(rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): ", sentence)
+    # A function, or the place: itself, or a file in it that has no such keys.
+    function = r"[\w.]+\(\): "
+    file = rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): " if place else function
+    start = re.match(f"{function}|{file}", sentence)
     if start is None:
         return sentence
 
     def option(match: re.Match[str]) -> str:
         name, value = match.groups()
-        if name not in names:
-            return match[0]
-        return f"{names[name]} {value}" if value else names[name]
+        return f"{names[name]} {value or ''}".rstrip() if name in names else match[0]
 
     text = sentence[start.end() :]
     new_text = re.sub(r"`([\w.]+)(?:=(\w+))?`", option, text)
-    if new_text == text:
-        return sentence
-    return new_text if function else start[0] + new_text
+    if re.match(function, start[0]) and new_text != text:
+        return new_text
+    return start[0] + new_text
 
 
 @contextmanager
@@ -200,20 +197,15 @@ def _line_report() -> Report:
     def report(stage: str, done: float, total: float) -> None:
         nonlocal last
         moment = time.monotonic()
-        begin.setdefault(stage, (moment, done))
+        start, base = begin.setdefault(stage, (moment, done))
         if moment - last < _PERIOD:
             return
-        start, base = begin[stage]
         last = moment
         seconds = moment - start
-        # At the pace of the steps that are done.
-        estimate = ""
-        if done > base:
-            estimate = f", about {_clock(seconds * (total - done) / (done - base))} left"
-        print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{estimate}.")
+        line = f"{stage}: {int(done)}/{total:.0f}, {timedelta(seconds=round(seconds))} elapsed"
+        if done > base:  # at the pace of the steps that are done
+            left = timedelta(seconds=round(seconds * (total - done) / (done - base)))
+            line += f", about {left} left"
+        print_warning(f"{line}.")
 
     return report
-
-
-def _clock(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
