@@ -49,7 +49,7 @@ from morgs_mi.core.gaussians import Gaussians
 _PER_WORD = 16
 _FREE_INTEGERS = 2**22
 _DTYPES = {"head": "uint32", "code": "uint32", "parent": "uint8", "offset": "uint32"}
-_COARSEST = 80  # quarter octaves: a million times the step
+_MAX_QUANTIZER_STEP = 80  # quarter octaves: a million times the step
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,35 +192,43 @@ def residual_packet(
     if births:
         birth_groups = {name: value[-births:] for name, value in groups.items()}
         birth_grid = new_grid(birth_groups, cameras, config)
-    coarseness, codes = _sized_codes(coder, birth_grid, config)
-    arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
+    quantizer_step, codes = _sized_codes(coder, birth_grid, config)
+    arrays = {
+        "parent": previous.digest,
+        "head": np.array([births, quantizer_step], np.uint32),
+        **codes,
+    }
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
 
 def _sized_codes(
     coder: Coder, birth_grid: Grid | None, config: CodecConfig
 ) -> tuple[int, dict[str, np.ndarray]]:
-    """Return the coarseness of the changes, at which they fit into the `target_size` if there is
-    one, and their words.
+    """Return the quantizer step of the changes, with which they fit into the `target_size` if there
+    is one, and their words.
     """
     target = config.target_size
-    coarseness = round(4 * np.log2(config.birth_precision))
+    quantizer_step = round(4 * np.log2(config.birth_precision))
     if target:
-        # The least coarseness at which the changes are estimated to take `target` bytes.
-        high = _COARSEST
-        while coarseness < high:
-            middle = (coarseness + high) // 2
+        # The least quantizer step at which the changes are estimated to take `target` bytes.
+        high = _MAX_QUANTIZER_STEP
+        while quantizer_step < high:
+            middle = (quantizer_step + high) // 2
             r = coder.rounded(middle)
             bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, middle))))
             if bits / 8 <= target:
                 high = middle
             else:
-                coarseness = middle + 1
-    codes = _codes(coder, coarseness, birth_grid)
-    while target and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > target:
-        coarseness += 1
-        codes = _codes(coder, coarseness, birth_grid)
-    return coarseness, codes
+                quantizer_step = middle + 1
+    codes = _codes(coder, quantizer_step, birth_grid)
+    while (
+        target
+        and quantizer_step < _MAX_QUANTIZER_STEP
+        and sum(c.nbytes for c in codes.values()) > target
+    ):
+        quantizer_step += 1
+        codes = _codes(coder, quantizer_step, birth_grid)
+    return quantizer_step, codes
 
 
 def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
@@ -301,13 +309,13 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
-    births, coarseness = _head(packet, 2)
-    _check_most(coarseness, _COARSEST, "its coarseness")
+    births, quantizer_step = _head(packet, 2)
+    _check_most(quantizer_step, _MAX_QUANTIZER_STEP, "its quantizer step")
     _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     code = packet.arrays["code"]
     grid = previous.grid
     reader = ColumnReader(code)
-    values, dead = take_change(reader, grid, coarseness)
+    values, dead = take_change(reader, grid, quantizer_step)
     survivors = np.flatnonzero(~dead)
     total = len(survivors) + births
     _check_words(code, births, total, grid.degree, grid.optional)
@@ -323,7 +331,7 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
         offset_reader = ColumnReader(packet.arrays["offset"])
         r = np.stack([offset_reader.take(len(rows)) for _ in range(3)], axis=1)
         offset = np.zeros((total, 3), np.float32)
-        offset[rows] = r * offset_steps(new.select(rows), coarseness)
+        offset[rows] = r * offset_steps(new.select(rows), quantizer_step)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     new_ids = previous.next_id + np.arange(births, dtype=np.uint32)
@@ -372,9 +380,9 @@ def _fill(
         column[:] = bounded(reader.take(len(columns)) + shift, limit, what)
 
 
-def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
-    """Return the words of the changes in steps of a coarseness, and of the births."""
-    r = coder.rounded(coarseness)
+def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
+    """Return the words of the changes with a quantizer step, and of the births."""
+    r = coder.rounded(quantizer_step)
     writer = ColumnWriter()
     for column in coder.columns(r):
         writer.put(column)
@@ -385,7 +393,7 @@ def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, 
     codes = {"code": _padded(writer.words(), births, len(coder.survivors) + births, coder.grid)}
     if coder.offset is not None:
         offset_writer = ColumnWriter()
-        for column in coder.offsets(r, coarseness):
+        for column in coder.offsets(r, quantizer_step):
             offset_writer.put(column)
         codes["offset"] = offset_writer.words()
     return codes

@@ -27,7 +27,7 @@ _THRESHOLD_DC = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Coder:
-    """Coder of the changes from a state to the next Gaussians, in steps of any coarseness."""
+    """Coder of the changes from a state to the next Gaussians, with any quantizer step."""
 
     grid: Grid  #: The N Gaussians of the state.
     survivors: np.ndarray  #: Their indices in the state [S], ascending; the others die.
@@ -37,10 +37,10 @@ class Coder:
     #: stored.
     offset: np.ndarray | None
 
-    def rounded(self, coarseness: int) -> np.ndarray:
+    def rounded(self, quantizer_step: int) -> np.ndarray:
         """Return the changes in whole steps, int32 [C, N]."""
         r = np.zeros((len(self.change), len(self.grid)), np.int32)
-        steps = self.change / _step(coarseness)
+        steps = self.change / _step(quantizer_step)
         for name, at in self.grid.columns.items():
             threshold = _THRESHOLD_DC if name == "sh_dc" else _THRESHOLD
             steps[at, np.max(np.abs(steps[at]), axis=0) < threshold] = 0
@@ -61,27 +61,29 @@ class Coder:
             for name, at in self.grid.columns.items():
                 yield from r[at].take(rows[change_masks[name][rows]], axis=1)
 
-    def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
+    def offsets(self, r: np.ndarray, quantizer_step: int) -> Iterator[np.ndarray]:
         """Yield the columns of the offsets of the survivors with changed means; none if they are
         not stored.
         """
         if self.offset is not None:
             rows = np.flatnonzero(np.any(r[self.grid.columns["means"]], axis=0)[self.survivors])
             real = self.offset[rows] / offset_steps(
-                self.grid.select(self.survivors[rows]), coarseness
+                self.grid.select(self.survivors[rows]), quantizer_step
             )
             yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
 
 
-def offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
+def offset_steps(grid: Grid, quantizer_step: int) -> np.ndarray:
     """Return the steps of the offsets, float64 [N, 1], world units, which are the steps of the
     changes of the means.
     """
-    return grid.steps("means") * _step(coarseness)
+    return grid.steps("means") * _step(quantizer_step)
 
 
-def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integers int32 [N, C] after changes in steps of a coarseness, and the mask of
+def take_change(
+    reader: ColumnReader, grid: Grid, quantizer_step: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the integers int32 [N, C] after changes with a quantizer step, and the mask of
     deaths, bool [N].
 
     Raises:
@@ -89,7 +91,7 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
     """
     values = grid.values.copy()
     dead = np.zeros(len(grid), bool)
-    step = _step(coarseness)
+    step = _step(quantizer_step)
     bits = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
     for rows in _classes(grid):
         geometry = reader.take(len(rows))
@@ -133,6 +135,6 @@ def _classes(grid: Grid) -> list[np.ndarray]:
     return [np.flatnonzero(~moving), np.flatnonzero(moving)]
 
 
-def _step(coarseness: int) -> np.ndarray:
+def _step(quantizer_step: int) -> np.ndarray:
     """Return the step of the changes in multiples of the grid's steps."""
-    return step_sizes(np.array(coarseness))
+    return step_sizes(np.array(quantizer_step))

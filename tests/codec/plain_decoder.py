@@ -135,7 +135,7 @@ def digest(state):
 def residual(state, payload):
     changes = arrays(payload)
     assert changes["parent"].tobytes() == digest(state)
-    births, coarseness = (int(x) for x in changes["head"])
+    births, quantizer_step = (int(x) for x in changes["head"])
     code = RangeCode(changes["code"])
     values = state["values"].copy()
     dead = np.zeros(len(state["ids"]), bool)
@@ -153,7 +153,7 @@ def residual(state, payload):
             for column in columns:
                 r = code.column(len(changed))
                 values[changed, column] += np.rint(
-                    r * F[coarseness % 4] * 2.0 ** (coarseness // 4)
+                    r * F[quantizer_step % 4] * 2.0 ** (quantizer_step // 4)
                 ).astype(np.int64)
     new = {
         **state,
@@ -168,7 +168,9 @@ def residual(state, payload):
         for axis in range(3):
             for i, r in zip(rows, code_of_offsets.column(len(rows)), strict=True):
                 e = int(new["exponents"][i, 0])
-                step = (F[e % 4] * 2.0 ** (e // 4)) * (F[coarseness % 4] * 2.0 ** (coarseness // 4))
+                step = (F[e % 4] * 2.0 ** (e // 4)) * (
+                    F[quantizer_step % 4] * 2.0 ** (quantizer_step // 4)
+                )
                 new["offset"][i, axis] = int(r) * step
     if births:
         added = born(code, births, state["degree"], state["confidence"])

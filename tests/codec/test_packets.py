@@ -172,7 +172,7 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
         ),
         (
             lambda _, residual: with_head(residual, 0, 81),
-            "its coarseness must be at most 80, got 81",
+            "its quantizer step must be at most 80, got 81",
         ),
         (lambda key, _: Packet(key.kind, 0, {"head": key.arrays["head"]}), "expected the arrays"),
         (lambda key, _: with_array(key, "offset", key.arrays["code"]), "expected the arrays"),

@@ -86,7 +86,7 @@ def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target: 
     packet = residual_packet(
         state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=target)
     )
-    # The coarseness has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
+    # It has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
     assert 0.75 * target < packet.arrays["code"].nbytes <= target
     assert len(decode(state, packet)) == 1500
 

@@ -5,7 +5,7 @@ import { ColumnReader } from "./range_code";
 type Arrays = Record<string, Uint8Array | Uint32Array>;
 
 const F = [1, 1.189207115002721, 1.4142135623730951, 1.681792830507429];
-const COARSEST = 80;
+const MAX_QUANTIZER_STEP = 80;
 const PER_WORD = 16;
 const DIED = 8;
 
@@ -124,12 +124,13 @@ function gaussians(reader: ColumnReader, N: number, M: number): Int32Array[] {
 
 /** Apply a residual to a state, in place; after an error, the state must not be used. */
 export function applyResidual(state: State, frame: number, arrays: Arrays): Change {
-  const [births, coarseness] = arrays.head;
+  const [births, quantizerStep] = arrays.head;
   const code = arrays.code as Uint32Array;
   if (frame !== state.frame + 1) throw new Error(`it does not continue frame ${state.frame}; a packet is missing`);
-  if (PER_WORD * code.length < births || coarseness > COARSEST) throw new Error("its head does not fit its code");
+  if (PER_WORD * code.length < births || quantizerStep > MAX_QUANTIZER_STEP)
+    throw new Error("its head does not fit its code");
   const reader = new ColumnReader(code);
-  const factor = quarterOctaves(coarseness);
+  const factor = quarterOctaves(quantizerStep);
   const changes = classes(state).map((members) => applyClass(state, members, reader, factor));
 
   const freed = changes.flatMap(({ freed }) => freed);
