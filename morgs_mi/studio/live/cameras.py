@@ -12,12 +12,12 @@ from threading import Condition, Event, Thread
 
 import numpy as np
 
-from morgs_mi.studio.live.feed import Bundle, Shot, close_images
+from morgs_mi.studio.live.feed import FrameSet, Shot, close_images
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver
 # them in bursts.
 _KEPT = 4
-# Largest skew of a bundle, s: the skew of unsynchronised cameras with one image per second.
+# Largest skew of a frame set, s: the skew of unsynchronised cameras with one image per second.
 _MAX_SKEW = 0.5
 _CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may take 10 s to fail
 
@@ -25,8 +25,8 @@ _CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may
 class CameraFeed:
     """Live images of cameras that are read side by side.
 
-    Images are bundled by the times of their arrival: the newest one of the slowest camera, and of
-    each other camera the one that is nearest in time.
+    A frame set has the newest image of the slowest camera, and of each other camera the image with
+    the nearest time of arrival.
 
     Args:
         cameras: the images of each camera, uint8 [H, W, 3], RGB, by its name, with None where one
@@ -59,13 +59,13 @@ class CameraFeed:
         for camera in self._cameras:
             camera.start()
 
-    def newest(self, after: Bundle | None = None) -> Bundle | None:
-        """Wait for the newest bundle and return it; None if no camera delivers images any more.
+    def newest(self, after: FrameSet | None = None) -> FrameSet | None:
+        """Wait for the newest frame set and return it; None if no camera delivers images any more.
 
-        The first bundle has an image of every camera.
+        The first frame set has an image of every camera.
 
         Args:
-            after: the bundle before; all images of the new one are newer.
+            after: the frame set before; all images of the new one are newer.
 
         Raises:
             OSError, ValueError: a camera cannot be opened, or has no first image.
@@ -77,9 +77,9 @@ class CameraFeed:
             while True:
                 time_left = deadline - time.monotonic()
                 is_running = any(camera.reason is None for camera in self._cameras)
-                bundle = self._bundle(after, is_running, late=time_left <= 0)
-                if bundle is not None:
-                    return bundle
+                frame_set = self._frame_set(after, is_running, late=time_left <= 0)
+                if frame_set is not None:
+                    return frame_set
                 if is_running and time_left > 0:
                     self._change.wait(time_left)
                 elif after is not None:
@@ -92,7 +92,7 @@ class CameraFeed:
                     )
 
     def problem(self, camera: int) -> str:
-        """Return why a camera has no image in the last bundle."""
+        """Return why a camera has no image in the last frame set."""
         return self._cameras[camera].reason or f"no image for {self._timeout:g} s"
 
     def ended(self) -> str:
@@ -110,8 +110,8 @@ class CameraFeed:
         for camera in self._cameras:
             camera.join(max(0.0, deadline - time.monotonic()))
 
-    def _bundle(self, after: Bundle | None, is_running: bool, late: bool) -> Bundle | None:
-        """Return the bundle of the images that are there; None as long as an expected one is
+    def _frame_set(self, after: FrameSet | None, is_running: bool, late: bool) -> FrameSet | None:
+        """Return the frame set of the images that are there; None as long as an expected one is
         missing.
         """
         numbers = [-1] * len(self._cameras) if after is None else after.numbers
@@ -132,7 +132,7 @@ class CameraFeed:
             for shot, number in zip(shots, numbers, strict=True)
             if shot is not None
         ]
-        return Bundle(
+        return FrameSet(
             tuple(shot and shot.image for shot in shots),
             tuple((shot or camera.shots[-1]).number for shot, camera in pairs),
             max(shot.time for shot in shots if shot is not None),
@@ -140,8 +140,10 @@ class CameraFeed:
             0 if after is None else min(skipped),
         )
 
-    def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
-        """Return for each camera whether the bundle has to have its image.
+    def _expected(
+        self, new: Sequence[Sequence[Shot]], frame_set: FrameSet, late: bool
+    ) -> list[bool]:
+        """Return for each camera whether the frame set has to have its image.
 
         A camera that runs is waited for, unless it is late or was missing before; an image of
         another has to be of the time of the newest.
@@ -150,7 +152,7 @@ class CameraFeed:
         return [
             image is not None or bool(shots) if wait else recent
             for wait, image, shots, recent in zip(
-                waits, bundle.images, new, _simultaneous(new), strict=True
+                waits, frame_set.images, new, _simultaneous(new), strict=True
             )
         ]
 
@@ -219,7 +221,7 @@ class _Camera(Thread):
 
 
 def _simultaneous(new: Sequence[Sequence[Shot]]) -> list[bool]:
-    """Return for each camera whether its newest shot may be in a bundle with the newest of all."""
+    """Return for each camera whether its newest shot fits into a frame set with the newest."""
     last = max((shots[-1].time for shots in new if shots), default=0.0)
     return [bool(shots) and last - shots[-1].time <= _MAX_SKEW for shots in new]
 

@@ -17,7 +17,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Bundle:
+class FrameSet:
     """Images of the cameras at about one time."""
 
     #: Per camera uint8 [H, W, 3], RGB, None where it has none.
@@ -26,7 +26,7 @@ class Bundle:
     numbers: tuple[int, ...]
     time: float  #: At which the last of the images arrived, s of `time.monotonic`.
     skew: float  #: Largest difference in time between two of the images, s.
-    #: Number of images that each camera delivered after the bundle before and that are in none.
+    #: Number of images that each camera delivered after the frame set before and that are in none.
     dropped: int
 
 

@@ -28,7 +28,7 @@ from morgs_mi.runs.fit_capture import Prepared, push_frame
 from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.studio.live.cameras import CameraFeed
-from morgs_mi.studio.live.feed import Bundle
+from morgs_mi.studio.live.feed import FrameSet
 from morgs_mi.studio.live.live_capture import begin_capture, read_calibration, write_images
 from morgs_mi.studio.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.studio.live.sources import Source, open_feed
@@ -119,7 +119,7 @@ class _LiveFrames:
     """
 
     def __init__(
-        self, feed: CameraFeed, capture: Capture, first: Bundle, config: LiveConfig
+        self, feed: CameraFeed, capture: Capture, first: FrameSet, config: LiveConfig
     ) -> None:
         self.capture = capture
         self.config = config
@@ -127,29 +127,31 @@ class _LiveFrames:
         self.first = first
         self._missing_names: set[str] = set()
 
-    def __iter__(self) -> Iterator[tuple[Bundle, PartialFrame]]:
+    def __iter__(self) -> Iterator[tuple[FrameSet, PartialFrame]]:
         """Yield whenever the next frame is asked for the newest images, as recorded and as
         processed.
         """
-        bundle = self.first
+        frame_set = self.first
         frame = 0
         begin = float("inf")
-        while bundle is not None and bundle.time - begin <= (self.config.seconds or float("inf")):
-            yield bundle, self._processed(bundle, frame)
+        while frame_set is not None and frame_set.time - begin <= (
+            self.config.seconds or float("inf")
+        ):
+            yield frame_set, self._processed(frame_set, frame)
             frame = frame + 1
             begin = min(begin, time.monotonic())
             if frame == self.config.frames:
                 return
-            if (bundle := self._feed.newest(bundle)) is None:
+            if (frame_set := self._feed.newest(frame_set)) is None:
                 _LOG.warning("the fit ends after frame %d: %s", frame - 1, self._feed.ended())
 
-    def _processed(self, bundle: Bundle, frame: int) -> PartialFrame:
-        """Return the processed images of a bundle; a camera that has none, or none of its size, is
-        logged once.
+    def _processed(self, frame_set: FrameSet, frame: int) -> PartialFrame:
+        """Return the processed images of a frame set; a camera that has none, or none of its size,
+        is logged once.
         """
         names = self.capture.names
         problems: dict[str, str] = {}
-        for k, image in enumerate(bundle.images):
+        for k, image in enumerate(frame_set.images):
             recorded_size = self.capture.recorded_sizes[k]
             if image is None:
                 problems[names[k]] = self._feed.problem(k)
@@ -161,12 +163,12 @@ class _LiveFrames:
         self._missing_names = set(problems)
 
         def process(view: int) -> np.ndarray | None:
-            image = bundle.images[view]
+            image = frame_set.images[view]
             if image is None or names[view] in problems:
                 return None
             return self.capture.process(view, image)
 
-        images = map_in_threads(process, range(len(bundle.images)))
+        images = map_in_threads(process, range(len(frame_set.images)))
         sentences = tuple(f"{name}: {problem}" for name, problem in problems.items())
         return PartialFrame(frame, tuple(images), sentences)
 
@@ -189,8 +191,8 @@ def _fit(
     rows: list[LiveFrame] = []
     with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
         try:
-            for bundle, frame in frames:
-                writing_task = in_background(partial(_record, frames, out, bundle, frame))
+            for frame_set, frame in frames:
+                writing_task = in_background(partial(_record, frames, out, frame_set, frame))
                 packet, report = push_frame(
                     loop, frame, train, None if rows else on_stage, None, recording.show
                 )
@@ -198,10 +200,10 @@ def _fit(
                 writing_task.result()
                 row = LiveFrame(
                     frame.index,
-                    bundle.time - frames.first.time,
-                    time.monotonic() - bundle.time,
-                    bundle.skew,
-                    bundle.dropped,
+                    frame_set.time - frames.first.time,
+                    time.monotonic() - frame_set.time,
+                    frame_set.skew,
+                    frame_set.dropped,
                     frame.problems,
                 )
                 live = [asdict(r) for r in (*rows, row)]
@@ -219,11 +221,11 @@ def _fit(
     return rows
 
 
-def _record(frames: _LiveFrames, out: Path, bundle: Bundle, frame: PartialFrame) -> None:
+def _record(frames: _LiveFrames, out: Path, frame_set: FrameSet, frame: PartialFrame) -> None:
     """Write the recorded images of a frame into the capture, which has the first frame's."""
     if frames.config.record and frame.index:
         images = [
             None if result is None else image
-            for image, result in zip(bundle.images, frame.images, strict=True)
+            for image, result in zip(frame_set.images, frame.images, strict=True)
         ]
         write_images(out / "capture", frames.capture.names, images, frame.index)

@@ -142,13 +142,13 @@ def test_open_feed__of_videos_begins_with_their_first_images(tmp_path: Path, loo
         [clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop)
     )
     try:
-        bundle = first = feed.newest()
+        frame_set = first = feed.newest()
         assert first is not None
         assert max(first.numbers) < 8, "without a time to adjust the exposure"
-        while bundle is not None and bundle.numbers[0] < 25:
-            bundle = feed.newest(bundle)
-        assert (bundle is None) != loop
-        if bundle is None:
+        while frame_set is not None and frame_set.numbers[0] < 25:
+            frame_set = feed.newest(frame_set)
+        assert (frame_set is None) != loop
+        if frame_set is None:
             assert feed.ended() == "cam0, cam1: it has ended; --loop repeats videos"
     finally:
         feed.close()
