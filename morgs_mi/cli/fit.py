@@ -59,8 +59,8 @@ class Fit:
     settings: GivenSettings = field(default_factory=Settings)
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
-    segments: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
-    """Number of stretches of the recording that are fitted side by side, by the extra cluster; each
+    chunks: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
+    """Number of parts of the recording that are fitted side by side, by the extra cluster; each
     begins with a keyframe."""
     scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS", text=_SCHEDULER)] = None
     print_config: Flag = False
@@ -80,25 +80,25 @@ class Fit:
                 "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before "
                 "options with several values, such as --test-view, and see morgs-mi fit --help."
             )
-        if self.segments is not None:
-            check_value("fit()", "segments", self.segments, Annotated[int, Ge(1)])
+        if self.chunks is not None:
+            check_value("fit()", "chunks", self.chunks, Annotated[int, Ge(1)])
         self.settings.check_methods(config)
         views = held_out(self.test_view)
         reading = self.reading.read_config()
         capture = load_capture(self.capture, self.downscale, views, self.frames, reading)
-        if self.segments is not None or self.scheduler is not None:
-            from morgs_mi.runs.cluster.seams import SegmentConfig
-            from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
+        if self.chunks is not None or self.scheduler is not None:
+            from morgs_mi.runs.cluster.boundaries import ChunkConfig
+            from morgs_mi.runs.cluster.chunks import ChunkedRun, noting_chunks
             from morgs_mi.runs.cluster.workers import cores, open_client
 
-            segments = SegmentConfig(self.segments or 1)
-            workers = min(segments.count, cores())
+            chunks = ChunkConfig(self.chunks or 1)
+            workers = min(chunks.count, cores())
             with (
-                noting_segments(self.out),
+                noting_chunks(self.out),
                 progress() as report,
                 open_client(self.scheduler, workers) as client,
             ):
-                run = SegmentedRun(capture, self.out, client, config, segments, report)
+                run = ChunkedRun(capture, self.out, client, config, chunks, report)
                 reports = run.fit(self.resume)
         else:
             from morgs_mi.runs.fit_capture import stream_capture

@@ -88,7 +88,7 @@ def fit_first_frame(
     steps = config.planned_steps
     losses = {}
     order = iter(view_order(len(problem.views), steps, rng))
-    for start, stop in fit.stretches(steps):
+    for start, stop in fit.chunks(steps):
         if on_round is not None and fit.has_round(start):
             on_round(fit.gaussians)
         fit.prepare(start)
@@ -126,8 +126,8 @@ class _FirstFrameFit:
         """The Gaussians with the current parameters."""
         return self._initial.with_parameters(values_of(self._optimizer))
 
-    def stretches(self, steps: int) -> list[tuple[int, int]]:
-        """Return (first step, end) of the stretches of steps without an event."""
+    def chunks(self, steps: int) -> list[tuple[int, int]]:
+        """Return (first step, end) of the chunks of steps without an event."""
         return list(pairwise(sorted({0, *self._bands, *self._rounds, steps})))
 
     def has_round(self, step: int) -> bool:
@@ -147,14 +147,14 @@ class _FirstFrameFit:
     def run(self, views: Iterable[int], first: int, steps: int) -> dict[str, float]:
         """Make the steps of some views, from step `first` of `steps`; return the losses by name."""
         progress = self._progress
-        stretch = Steps(
+        chunk = Steps(
             views,
             first,
             rate_factor=lambda step: _FINAL_RATE ** (step / steps),
             on_step=None if progress is None else lambda count: progress(count, steps),
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(self._views)),
         )
-        return optimise(self._optimizer, self._rates, self._losses_at, stretch)
+        return optimise(self._optimizer, self._rates, self._losses_at, chunk)
 
     def _use_views(self, problem: FirstFrameProblem) -> None:
         """Let the next steps fit the views of `problem`."""

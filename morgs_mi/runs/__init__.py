@@ -1,3 +1,3 @@
-"""Whole jobs: fits of captures, live fits, segments on several machines, imports, the
+"""Whole jobs: fits of captures, live fits, chunks on several machines, imports, the
 demonstration.
 """

@@ -60,7 +60,7 @@ Entry = tuple[int, int, int]
 
 class FitFiles(NamedTuple):
     """Stream and report of a fit, and the description of its capture; None: there is none, as in a
-    segment.
+    chunk.
     """
 
     stream: Path
@@ -272,7 +272,7 @@ def interrupted_fit(
         files: its stream and its report.
         capture: what is fitted.
         metadata: header that the fit would write.
-        first: frame of the first row of the report: 0, or the start of a segment.
+        first: frame of the first row of the report: 0, or the start of a chunk.
 
     Raises:
         ValueError: the stream or the report is damaged, or belongs to another capture or other
@@ -285,7 +285,7 @@ def interrupted_fit(
         return None
     check_same_fit(stream, capture, metadata)
     index, end = stream.check()
-    # After the first frame of a segment alone, a fit would continue without its displacements.
+    # After the first frame of a chunk alone, a fit would continue without its displacements.
     if not index or (first and index[-1][1] == first):
         return None
     frame = index[-1][1]

@@ -23,8 +23,8 @@ from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.segments import SegmentedRun
+from morgs_mi.runs.cluster.boundaries import ChunkConfig
+from morgs_mi.runs.cluster.chunks import ChunkedRun
 from morgs_mi.runs.cluster.tasks import Part
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
@@ -141,7 +141,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
         ),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
         (["--seed", "-1"], ("--seed must be at least 0, got -1",)),
-        (["--segments", "0"], ("--segments must be at least 1, got 0",)),
+        (["--chunks", "0"], ("--chunks must be at least 1, got 0",)),
         (["--sh-degree", "4"], ("--sh-degree must be at least 0 and at most 3, got 4",)),
         (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
         (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
@@ -391,32 +391,32 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
 
 
 @pytest.mark.slow
-def test_fit__fits_segments_side_by_side_and_names_what_stands_when_interrupted(
+def test_fit__fits_chunks_side_by_side_and_names_what_stands_when_interrupted(
     tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
-    short = SegmentConfig(passes=1, epochs=1)
-    monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
+    short = ChunkConfig(passes=1, epochs=1)
+    monkeypatch.setattr(ChunkConfig.__init__, "__defaults__", astuple(short))
     clip = write_recording(tmp_path / "clip", 4)
     out = tmp_path / "out"
-    add = SegmentedRun.add_part
+    add = ChunkedRun.add_part
 
-    def add_and_stop(fit: SegmentedRun, part: Part) -> None:
+    def add_and_stop(fit: ChunkedRun, part: Part) -> None:
         add(fit, part)
         raise KeyboardInterrupt
 
-    args = ["fit", str(clip), str(out), *OPTIONS, "--segments", "2"]
+    args = ["fit", str(clip), str(out), *OPTIONS, "--chunks", "2"]
     with monkeypatch.context() as patch:
-        patch.setattr(SegmentedRun, "add_part", add_and_stop)
+        patch.setattr(ChunkedRun, "add_part", add_and_stop)
         status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     assert status == 130
     assert (
         error.splitlines()[-1]
-        == f"Interrupted. {out / 'segments'} holds 2 frames; continue with `{again}`."
+        == f"Interrupted. {out / 'chunks'} holds 2 frames; continue with `{again}`."
     )
     status, output, _ = run(*args, "--resume")
     assert (status, "stream.morgs: 4 frames" in output) == (0, True)
     assert not any(record.name.startswith("distributed") for record in caplog.records)
     assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
-    assert_refused(run(*args, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
+    assert_refused(run(*args, "--chunks", 3), "--chunks must be 1 to 2 for 4 frames", "got 3")

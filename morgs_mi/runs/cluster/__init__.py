@@ -1,1 +1,1 @@
-"""Fits in many processes, on one machine or on a Dask cluster: segments of a recording."""
+"""Fits in many processes, on one machine or on a Dask cluster: chunks of a recording."""

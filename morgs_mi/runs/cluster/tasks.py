@@ -1,4 +1,4 @@
-"""The task of the workers: fit a few frames of a segment.
+"""The task of the workers: fit a few frames of a chunk.
 
 A task gets the state as packets, reads the recording from a path that the worker sees, and returns
 packets. It writes no files and can be repeated anywhere. A worker keeps the loop of its last task:
@@ -21,7 +21,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
-from morgs_mi.runs.cluster.seams import SegmentConfig, fit_seam_frame
+from morgs_mi.runs.cluster.boundaries import ChunkConfig, fit_boundary_frame
 from morgs_mi.runs.cluster.workers import prepared, worker_name
 from morgs_mi.runs.fit_capture import push_frame, with_next
 from morgs_mi.runs.fit_files import due_keyframe, restart_of
@@ -57,7 +57,7 @@ class Fit:
 
     source: Source  #: The recording.
     config: StreamConfig  #: Settings.
-    segments: SegmentConfig  #: The segments, and the settings of their seams.
+    chunks: ChunkConfig  #: The chunks, and the settings of their boundaries.
     variant: str  #: Mitsuba variant.
     versions: tuple[tuple[str, str], ...]  #: As `installed` returns them to the client.
     #: Refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
@@ -78,14 +78,14 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Segment:
-    """A stretch of a recording, from frame `start` up to `stop`, and how far it is fitted."""
+class Chunk:
+    """A part of a recording, from frame `start` up to `stop`, and how far it is fitted."""
 
     start: int
     stop: int
     frame: int  #: The next one to fit.
     #: Encoded packets that lead a decoder to the state before that frame, a keyframe and perhaps a
-    #: residual. Before a segment begins, they lead to the common model; before the recording
+    #: residual. Before a chunk begins, they lead to the common model; before the recording
     #: begins, there are none.
     restart: tuple[bytes, ...] = ()
 
@@ -102,7 +102,7 @@ class Segment:
 class Part:
     """Result of a task."""
 
-    segment: Segment  #: The segment after its frames.
+    chunk: Chunk  #: The chunk after its frames.
     packets: tuple[bytes, ...]  #: Encoded packets of the frames, re-emitted keyframes included.
     reports: tuple[FrameReport, ...]  #: Of the frames.
     worker: str  #: Address of the worker.
@@ -110,62 +110,62 @@ class Part:
 
 
 # The loop of the last task by what continues it, with the capture and its next frames.
-_OPEN: dict[tuple[str, Segment], tuple[StreamLoop, Capture, Iterator[PartialFrame]]] = {}
+_OPEN: dict[tuple[str, Chunk], tuple[StreamLoop, Capture, Iterator[PartialFrame]]] = {}
 
 
-def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
-    """Fit the next frames of a segment, up to `stop`, one after the other."""
+def fit_frames(fit: Fit, chunk: Chunk, stop: int) -> Part:
+    """Fit the next frames of a chunk, up to `stop`, one after the other."""
     with prepared(fit.variant, fit.versions) as messages:
         packets = list[Packet]()
         reports = list[FrameReport]()
-        if 0 < segment.start == segment.frame:
-            keyframe, report = _first_frame(fit, segment)
+        if 0 < chunk.start == chunk.frame:
+            keyframe, report = _first_frame(fit, chunk)
             packets.append(keyframe)
             reports.append(report)
-            segment = replace(segment, frame=segment.start + 1, restart=(keyframe.encoded,))
-        last = _OPEN.pop((repr(fit), segment), None)
+            chunk = replace(chunk, frame=chunk.start + 1, restart=(keyframe.encoded,))
+        last = _OPEN.pop((repr(fit), chunk), None)
         _OPEN.clear()
         if last is not None:
             loop, capture, recorded = last
         else:
             capture = fit.open()
             loop = StreamLoop.of(capture, fit.config)
-            recorded = capture.partial_frames(segment.start)
-            coded = segment.coded
+            recorded = capture.partial_frames(chunk.start)
+            coded = chunk.coded
             if coded is not None:
                 # Exposures are relative to the first frame of the recording.
-                first = _images(capture, 0, 1) if segment.start else []
-                frames = islice(recorded, segment.frame - segment.start)
+                first = _images(capture, 0, 1) if chunk.start else []
+                frames = islice(recorded, chunk.frame - chunk.start)
                 past = (past_frame.comparable(capture.train_views) for past_frame in frames)
                 loop.resume(coded, chain(first, past), fit.balance)
-        restart = segment.restart
-        for frame, upcoming in with_next(islice(recorded, stop - segment.frame)):
+        restart = chunk.restart
+        for frame, upcoming in with_next(islice(recorded, stop - chunk.frame)):
             last_state = loop.state.coded
             packet, report = push_frame(loop, frame, capture.train_views, None, upcoming)
             packets += [packet, *due_keyframe(loop.state.coded, fit.config.codec.keyframe_interval)]
             reports.append(report)
             restart = restart_of(last_state, packet)
-        segment = replace(segment, frame=stop, restart=restart)
-        _OPEN[repr(fit), segment] = loop, capture, recorded
+        chunk = replace(chunk, frame=stop, restart=restart)
+        _OPEN[repr(fit), chunk] = loop, capture, recorded
         contents = tuple(packet.encoded for packet in packets)
-        return Part(segment, contents, tuple(reports), worker_name(), tuple(messages))
+        return Part(chunk, contents, tuple(reports), worker_name(), tuple(messages))
 
 
-def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:
-    """Fit the frames before a segment that follow the common model, and its first one; return its
+def _first_frame(fit: Fit, chunk: Chunk) -> tuple[Packet, FrameReport]:
+    """Fit the frames before a chunk that follow the common model, and its first one; return its
     keyframe.
     """
     capture = fit.open()
-    common = segment.coded
+    common = chunk.coded
     assert common is not None
-    loop = StreamLoop.of(capture, fit.segments.overlap_config(fit.config))
-    frame = max(segment.start - fit.segments.overlap, common.frame + 1)
+    loop = StreamLoop.of(capture, fit.chunks.overlap_config(fit.config))
+    frame = max(chunk.start - fit.chunks.overlap, common.frame + 1)
     loop.resume(common, _images(capture, 0, common.frame + 1), fit.balance)
     (images,) = _images(capture, frame, frame + 1)
-    coded, report = fit_seam_frame(loop.setup, loop.state, frame, images, fit.segments)
+    coded, report = fit_boundary_frame(loop.setup, loop.state, frame, images, fit.chunks)
     loop.resume(coded, [*_images(capture, 0, 1), images], fit.balance)
     seconds = report.seconds
-    for recorded, upcoming in with_next(capture.partial_frames(frame + 1, segment.start + 1)):
+    for recorded, upcoming in with_next(capture.partial_frames(frame + 1, chunk.start + 1)):
         _, report = push_frame(loop, recorded, capture.train_views, None, upcoming)
         seconds += report.seconds
     assert loop.state.coded is not None

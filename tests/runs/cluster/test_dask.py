@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.runs.cluster.segments import SegmentedRun
+from morgs_mi.runs.cluster.chunks import ChunkedRun
 from morgs_mi.runs.cluster.workers import open_client
-from tests.runs.cluster import test_segments
-from tests.runs.cluster.test_segments import SEGMENTS, SETTINGS, stream_of, when_fitted
+from tests.runs.cluster import test_chunks
+from tests.runs.cluster.test_chunks import CHUNKS, SETTINGS, stream_of, when_fitted
 
 pytest.importorskip("distributed", reason="comes with the extra `cluster`")
 
 
-capture = test_segments.capture
-short_tasks = test_segments.short_tasks
+capture = test_chunks.capture
+short_tasks = test_chunks.short_tasks
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def whole(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The stream of workers that are started for it."""
     out = tmp_path_factory.mktemp("whole")
     with open_client(count=2) as client:
-        SegmentedRun(capture, out, client, SETTINGS, SEGMENTS).fit()
+        ChunkedRun(capture, out, client, SETTINGS, CHUNKS).fit()
     return stream_of(out)
 
 
@@ -56,7 +56,7 @@ def address(cluster: subprocess.Popen[str]) -> str:
 
 
 @pytest.mark.slow
-def test_SegmentedRun__names_a_lost_scheduler_and_is_resumed(
+def test_ChunkedRun__names_a_lost_scheduler_and_is_resumed(
     capture: Capture,
     whole: bytes,
     cluster: subprocess.Popen[str],
@@ -72,7 +72,7 @@ def test_SegmentedRun__names_a_lost_scheduler_and_is_resumed(
         ),
         open_client(address(cluster)) as client,
     ):
-        SegmentedRun(capture, tmp_path, client, SETTINGS, SEGMENTS, lost).fit()
+        ChunkedRun(capture, tmp_path, client, SETTINGS, CHUNKS, lost).fit()
     with open_client(count=2) as client:
-        SegmentedRun(capture, tmp_path, client, SETTINGS, SEGMENTS).fit(resume=True)
+        ChunkedRun(capture, tmp_path, client, SETTINGS, CHUNKS).fit(resume=True)
     assert stream_of(tmp_path) == whole

@@ -65,7 +65,7 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
     streams = sorted(
         str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs")
     )
-    assert streams == ["cluster", "segments"]
+    assert streams == ["chunks", "cluster"]
     for name in streams:
         assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(
             range(FRAMES)

@@ -12,8 +12,8 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind, decode_packet
 from morgs_mi.codec.packets import reemitted_keyframe
-from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.tasks import Fit, Segment, Source, fit_frames
+from morgs_mi.runs.cluster.boundaries import ChunkConfig
+from morgs_mi.runs.cluster.tasks import Chunk, Fit, Source, fit_frames
 from morgs_mi.runs.cluster.workers import installed
 from tests.scenes.recording import CONFIG, write_recording
 
@@ -21,32 +21,32 @@ from tests.scenes.recording import CONFIG, write_recording
 @pytest.fixture(scope="module")
 def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
     capture = load_capture(write_recording(tmp_path_factory.mktemp("clip"), 5))
-    return Fit(Source.of(capture), CONFIG, SegmentConfig(), str(mi.variant()), installed())
+    return Fit(Source.of(capture), CONFIG, ChunkConfig(), str(mi.variant()), installed())
 
 
 @pytest.mark.slow
 def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
     fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = fit_frames(fit, Segment(0, 5, 0), 3)
-    assert first.segment == replace(first.segment, start=0, stop=5, frame=3)
+    first = fit_frames(fit, Chunk(0, 5, 0), 3)
+    assert first.chunk == replace(first.chunk, start=0, stop=5, frame=3)
     monkeypatch.setattr(Source, "open", None)
-    result = fit_frames(fit, first.segment, 5)
+    result = fit_frames(fit, first.chunk, 5)
     monkeypatch.undo()
-    again = fit_frames(fit, first.segment, 5)
+    again = fit_frames(fit, first.chunk, 5)
     assert again.packets == result.packets
-    assert again.segment == result.segment
+    assert again.chunk == result.chunk
     assert [report.frame for report in again.reports] == [3, 4]
 
 
 @pytest.mark.slow
-def test_fit_frames__begins_a_segment_with_a_keyframe_after_the_common_model(fit: Fit) -> None:
-    common = fit_frames(fit, Segment(0, 2, 0), 2)
-    assert common.segment.coded is not None
-    start = (reemitted_keyframe(common.segment.coded).encoded,)
+def test_fit_frames__begins_a_chunk_with_a_keyframe_after_the_common_model(fit: Fit) -> None:
+    common = fit_frames(fit, Chunk(0, 2, 0), 2)
+    assert common.chunk.coded is not None
+    start = (reemitted_keyframe(common.chunk.coded).encoded,)
     config = replace(fit.config, codec=CodecConfig(keyframe_interval=0))
-    fit = replace(fit, config=config, segments=SegmentConfig(2, passes=1, epochs=1, overlap=1))
-    part = fit_frames(fit, Segment(3, 5, 3, start), 5)
+    fit = replace(fit, config=config, chunks=ChunkConfig(2, passes=1, epochs=1, overlap=1))
+    part = fit_frames(fit, Chunk(3, 5, 3, start), 5)
     kinds = [(packet.kind, packet.frame) for packet in map(decode_packet, part.packets)]
     assert kinds == [(PacketKind.KEYFRAME, 3), (PacketKind.RESIDUAL, 4)]
     assert [report.frame for report in part.reports] == [3, 4]
@@ -58,7 +58,7 @@ def test_fit_frames__refuses_other_versions(fit: Fit) -> None:
     with pytest.raises(
         ValueError, match=r"expected a worker with drjit 0\.1 like the client, got 1\.5\.0; install"
     ):
-        fit_frames(replace(fit, versions=versions), Segment(0, 1, 0), 1)
+        fit_frames(replace(fit, versions=versions), Chunk(0, 1, 0), 1)
 
 
 def test_source__opens_the_capture_as_it_is(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Seams: the start of a segment."""
+"""Boundaries: the start of a chunk."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.seams import SegmentConfig, fit_seam_frame
+from morgs_mi.runs.cluster.boundaries import ChunkConfig, fit_boundary_frame
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.recording import CONFIG, recording
 
 
 @pytest.mark.slow
-def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
+def test_fit_boundary_frame__leaves_what_is_static_as_it_is() -> None:
     capture = recording()
     settings = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=400))
     loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, settings)
@@ -25,8 +25,8 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
         loop.push(frame)
     base = loop.state.coded
     assert base is not None
-    config = SegmentConfig(passes=2, epochs=1)
-    coded, report = fit_seam_frame(loop.setup, loop.state, 4, images[4], config)
+    config = ChunkConfig(passes=2, epochs=1)
+    coded, report = fit_boundary_frame(loop.setup, loop.state, 4, images[4], config)
     assert (coded.frame, report.frame) == (4, 4)
     _, base_rows, coded_rows = np.intersect1d(base.ids, coded.ids, return_indices=True)
     same = np.all(base.grid.values[base_rows] == coded.grid.values[coded_rows], axis=1)
@@ -35,13 +35,13 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
 
 
 def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
-    first, second = (SegmentConfig().fit_config(CONFIG, number) for number in (0, 1))
+    first, second = (ChunkConfig().fit_config(CONFIG, number) for number in (0, 1))
     assert first.seed != second.seed
     assert first.fit.rates.scales == pytest.approx(2 * CONFIG.fit.rates.scales)
 
 
 def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
     config_of_fit = StreamConfig(fit=FitConfig(epochs=3))
-    config = SegmentConfig().overlap_config(config_of_fit)
+    config = ChunkConfig().overlap_config(config_of_fit)
     assert config.fit.epochs == 6
     assert replace(config, fit=config_of_fit.fit) == config_of_fit

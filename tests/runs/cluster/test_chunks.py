@@ -1,4 +1,4 @@
-"""Segments: the joined stream is an ordinary one, and what dies or is interrupted meanwhile leaves
+"""Chunks: the joined stream is an ordinary one, and what dies or is interrupted meanwhile leaves
 no trace.
 """
 
@@ -26,8 +26,8 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.segments import SegmentedRun
+from morgs_mi.runs.cluster.boundaries import ChunkConfig
+from morgs_mi.runs.cluster.chunks import ChunkedRun
 from morgs_mi.runs.cluster.workers import open_client
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.runs.fit_files import FILES
@@ -36,9 +36,9 @@ from tests.scenes.recording import CONFIG, write_recording
 
 FRAMES = 10
 STARTS = (0, 3, 7)
-# A keyframe that is re-emitted within a segment, and one that falls on a seam.
+# A keyframe that is re-emitted within a chunk, and one that falls on a boundary.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
-SEGMENTS = SegmentConfig(3, passes=2, epochs=1, overlap=2)
+CHUNKS = ChunkConfig(3, passes=2, epochs=1, overlap=2)
 
 
 @pytest.fixture(scope="module")
@@ -54,19 +54,19 @@ def client() -> Iterator[Client]:
 
 @pytest.fixture(autouse=True)
 def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tasks that end within the segments."""
-    monkeypatch.setattr("morgs_mi.runs.cluster.segments.TASK_FRAMES", 2)
+    """Tasks that end within the chunks."""
+    monkeypatch.setattr("morgs_mi.runs.cluster.chunks.TASK_FRAMES", 2)
 
 
 def fit(capture: Capture, out: Path, client: Client, **options) -> list[FrameReport]:
-    metadata = {"config": SETTINGS, "segments": SEGMENTS} | options
+    metadata = {"config": SETTINGS, "chunks": CHUNKS} | options
     resume = metadata.pop("resume", False)
-    return SegmentedRun(capture, out, client, **metadata).fit(resume)
+    return ChunkedRun(capture, out, client, **metadata).fit(resume)
 
 
 @pytest.fixture(scope="module")
 def whole(capture: Capture, client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fit in three segments, undisturbed, with tasks of another length than the tests'."""
+    """A fit in three chunks, undisturbed, with tasks of another length than the tests'."""
     out = tmp_path_factory.mktemp("whole")
     fit(capture, out, client)
     return out
@@ -85,10 +85,10 @@ def rows_of(out: Path) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_SegmentedRun__of_one_is_the_fit_in_one_process(
+def test_ChunkedRun__of_one_is_the_fit_in_one_process(
     capture: Capture, client: Client, tmp_path: Path
 ) -> None:
-    fit(capture, tmp_path / "one", client, segments=SegmentConfig(1))
+    fit(capture, tmp_path / "one", client, chunks=ChunkConfig(1))
     stream_capture(capture, tmp_path / "plain", SETTINGS)
     assert stream_of(tmp_path / "one") == stream_of(tmp_path / "plain")
     assert rows_of(tmp_path / "one") == rows_of(tmp_path / "plain")
@@ -96,7 +96,7 @@ def test_SegmentedRun__of_one_is_the_fit_in_one_process(
 
 
 @pytest.mark.slow
-def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
+def test_ChunkedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     reader = StreamReader(whole / "stream.morgs")
     assert reader.closed()
     assert sorted(path.name for path in whole.iterdir()) == sorted(FILES)
@@ -111,11 +111,11 @@ def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     sets = [set[int]() for _ in STARTS]
     for state in states:
         sets[np.searchsorted(STARTS, state.frame, "right") - 1] |= set(state.lasting_ids.tolist())
-    assert len(set().union(*sets)) == sum(map(len, sets)), "no id is in two segments"
+    assert len(set().union(*sets)) == sum(map(len, sets)), "no id is in two chunks"
 
 
 @pytest.mark.slow
-def test_SegmentedRun__reports_frames_and_workers(whole: Path) -> None:
+def test_ChunkedRun__reports_frames_and_workers(whole: Path) -> None:
     report = json.loads((whole / "report.json").read_text())
     assert [row["frame"] for row in report["frames"]] == list(range(FRAMES))
     sizes = {
@@ -148,7 +148,7 @@ def interrupt() -> None:
 @pytest.mark.parametrize(
     "count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))]
 )
-def test_SegmentedRun__interrupted_and_resumed_is_the_same(
+def test_ChunkedRun__interrupted_and_resumed_is_the_same(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, count: int
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -161,14 +161,14 @@ def test_SegmentedRun__interrupted_and_resumed_is_the_same(
 
 
 @pytest.mark.slow
-# After the first frame of a segment alone, and within a packet.
+# After the first frame of a chunk alone, and within a packet.
 @pytest.mark.parametrize(("frame", "more"), [(4, 0), (8, 40)])
-def test_SegmentedRun__resumes_after_the_beginning_of_a_segment(
+def test_ChunkedRun__resumes_after_the_beginning_of_a_chunk(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, frame: int, more: int
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(FRAMES, interrupt))
-    for path in (tmp_path / "segments").glob("*.morgs"):
+    for path in (tmp_path / "chunks").glob("*.morgs"):
         offset = next((at for _, number, at in StreamReader(path).index() if number >= frame), None)
         if offset is not None:
             os.truncate(path, offset + more)
@@ -179,7 +179,7 @@ def test_SegmentedRun__resumes_after_the_beginning_of_a_segment(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
-def test_SegmentedRun__with_a_killed_process_is_the_same(
+def test_ChunkedRun__with_a_killed_process_is_the_same(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, count: int
 ) -> None:
     def kill() -> None:
@@ -193,20 +193,20 @@ def test_SegmentedRun__with_a_killed_process_is_the_same(
 @pytest.mark.parametrize(
     ("count", "message"),
     [
-        (0, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 0"),
-        (6, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 6"),
+        (0, r"`chunks` must be 1 to 5 for 10 frames, 2 for each, got 0"),
+        (6, r"`chunks` must be 1 to 5 for 10 frames, 2 for each, got 6"),
     ],
 )
-def test_SegmentedRun__refuses_too_many(
+def test_ChunkedRun__refuses_too_many(
     capture: Capture, client, tmp_path: Path, count, message
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        fit(capture, tmp_path / "out", client, segments=SegmentConfig(count))
+        fit(capture, tmp_path / "out", client, chunks=ChunkConfig(count))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_SegmentedRun__does_not_resume_other_settings(
+def test_ChunkedRun__does_not_resume_other_settings(
     capture: Capture, client: Client, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -217,13 +217,13 @@ def test_SegmentedRun__does_not_resume_other_settings(
     ):
         fit(capture, tmp_path, client, config=replace(SETTINGS, seed=1), resume=True)
     with pytest.raises(
-        ValueError, match=r"expected to resume a fit with metadata\.segments\.starts = \[0, 3, 7\]"
+        ValueError, match=r"expected to resume a fit with metadata\.chunks\.starts = \[0, 3, 7\]"
     ):
-        fit(capture, tmp_path, client, segments=replace(SEGMENTS, count=2), resume=True)
+        fit(capture, tmp_path, client, chunks=replace(CHUNKS, count=2), resume=True)
 
 
 @pytest.mark.slow
-def test_SegmentedRun__keeps_an_earlier_fit_until_the_segments_are_joined(
+def test_ChunkedRun__keeps_an_earlier_fit_until_the_chunks_are_joined(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = shutil.copytree(whole, tmp_path / "out")
@@ -245,7 +245,7 @@ def test_SegmentedRun__keeps_an_earlier_fit_until_the_segments_are_joined(
 
 
 @pytest.mark.slow
-def test_SegmentedRun__triangulates_points_where_there_are_few(
+def test_ChunkedRun__triangulates_points_where_there_are_few(
     capture: Capture, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
@@ -254,7 +254,7 @@ def test_SegmentedRun__triangulates_points_where_there_are_few(
         few,
         tmp_path / "few",
         client,
-        segments=SegmentConfig(1),
+        chunks=ChunkConfig(1),
         config=StreamConfig(SETTINGS.fit, SETTINGS.motion),
     )
     assert (
@@ -264,9 +264,7 @@ def test_SegmentedRun__triangulates_points_where_there_are_few(
 
 
 @pytest.mark.slow
-def test_SegmentedRun__refines_cameras_once(
-    capture: Capture, client: Client, tmp_path: Path
-) -> None:
+def test_ChunkedRun__refines_cameras_once(capture: Capture, client: Client, tmp_path: Path) -> None:
     held_out = load_capture(capture.path, test_view=0)
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
@@ -286,7 +284,7 @@ def test_SegmentedRun__refines_cameras_once(
 
 
 @pytest.mark.slow
-def test_SegmentedRun__has_the_same_balance_of_the_cameras_in_all_segments(
+def test_ChunkedRun__has_the_same_balance_of_the_cameras_in_all_chunks(
     capture: Capture, client: Client, tmp_path: Path
 ) -> None:
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)

@@ -1,9 +1,9 @@
-"""A fit in segments: stretches of a recording that are fitted side by side and joined into one
+"""A fit in chunks: parts of a recording that are fitted side by side and joined into one
 stream.
 
-While it runs, OUT/segments has a stream and a report for each segment, to which the frames of each
+While it runs, OUT/chunks has a stream and a report for each chunk, to which the frames of each
 finished task are added. They are joined into OUT/stream.morgs at the end. Resuming continues every
-segment after its last frame.
+chunk after its last frame.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
-from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
-from morgs_mi.runs.cluster.tasks import Fit, Part, Segment, Source, fit_frames
+from morgs_mi.runs.cluster.boundaries import COMMON_FRAMES, ChunkConfig
+from morgs_mi.runs.cluster.tasks import Chunk, Fit, Part, Source, fit_frames
 from morgs_mi.runs.cluster.workers import installed, num_workers
 from morgs_mi.runs.fit_capture import Prepared
 from morgs_mi.runs.fit_files import (
@@ -51,17 +51,17 @@ from morgs_mi.runs.fit_files import (
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-FOLDER = "segments"
+FOLDER = "chunks"
 # Frames of a task, two at least: they are lost if a worker dies, and the progress is known that
 # finely.
 TASK_FRAMES = 10
-_MIN_FRAMES = 2  # of a segment
+_MIN_FRAMES = 2  # of a chunk
 _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
-def noting_segments(out: Path) -> Iterator[None]:
-    """Add to an interruption or a failure how many frames the segments of a fit in `out` hold."""
+def noting_chunks(out: Path) -> Iterator[None]:
+    """Add to an interruption or a failure how many frames the chunks of a fit in `out` hold."""
     try:
         yield
     except (KeyboardInterrupt, OSError, MemoryError) as error:
@@ -82,23 +82,23 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(trash, ignore_errors=True)
 
 
-class SegmentedRun:
-    """A fit of a capture in segments, side by side, into the files that `stream_capture` writes.
+class ChunkedRun:
+    """A fit of a capture in chunks, side by side, into the files that `stream_capture` writes.
 
     Args:
         capture: a capture from `load_capture`, at a path that all workers see.
         out: folder, made if missing.
         client: from `open_client`.
         config: settings.
-        segments: their number and the settings of the seams; None: one segment.
+        chunks: their number and the settings of the boundaries; None: one chunk.
         on_stage: called with (name of the stage, done, total).
 
     Example:
         >>> with open_client() as client:
-        ...     reports = SegmentedRun(capture, out, client, config, SegmentConfig(3)).fit()
+        ...     reports = ChunkedRun(capture, out, client, config, ChunkConfig(3)).fit()
 
     Raises:
-        ValueError: there are more segments than pairs of frames.
+        ValueError: there are more chunks than pairs of frames.
     """
 
     def __init__(
@@ -107,38 +107,38 @@ class SegmentedRun:
         out: str | Path,
         client: Client,
         config: StreamConfig,
-        segments: SegmentConfig | None = None,
+        chunks: ChunkConfig | None = None,
         on_stage: Report | None = None,
     ) -> None:
-        segments = segments or SegmentConfig()
+        chunks = chunks or ChunkConfig()
         self.capture = capture
         self.out = Path(out)
         self.client = client
         self.on_stage: Report = on_stage or (lambda *_: None)
         num_frames = capture.num_frames
         most = max(1, num_frames // _MIN_FRAMES)
-        if not 1 <= segments.count <= most:
+        if not 1 <= chunks.count <= most:
             raise ValueError(
-                f"SegmentedRun(): `segments` must be 1 to {most} for {num_frames} frames, "
-                f"{_MIN_FRAMES} for each, got {segments.count}."
+                f"ChunkedRun(): `chunks` must be 1 to {most} for {num_frames} frames, "
+                f"{_MIN_FRAMES} for each, got {chunks.count}."
             )
-        # First frames of segments of about the same length, and the number of frames.
-        starts = np.linspace(0, num_frames, segments.count + 1)
+        # First frames of chunks of about the same length, and the number of frames.
+        starts = np.linspace(0, num_frames, chunks.count + 1)
         self.starts: list[int] = starts.round().astype(int).tolist()
-        self.task = Fit(Source.of(capture), config, segments, str(mi.variant()), installed())
+        self.task = Fit(Source.of(capture), config, chunks, str(mi.variant()), installed())
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
-        if segments.count > 1:
-            self.metadata["segments"] = {"starts": self.starts[:-1], **asdict(segments)}
-        self.recordings: dict[int, Recording] = {}  # by the first frame of the segment
+        if chunks.count > 1:
+            self.metadata["chunks"] = {"starts": self.starts[:-1], **asdict(chunks)}
+        self.recordings: dict[int, Recording] = {}  # by the first frame of the chunk
         self.peaks: dict[str, int] = {}
         self.messages: set[str] = set()
 
     @interrupts_raised()
     def fit(self, resume: bool = False) -> list[FrameReport]:
-        """Fit, or continue, all segments and join them; return the reports of all frames.
+        """Fit, or continue, all chunks and join them; return the reports of all frames.
 
         Args:
-            resume: continue the segments in `out`. The stream has the same bytes as without an
+            resume: continue the chunks in `out`. The stream has the same bytes as without an
                 interruption.
 
         Raises:
@@ -147,7 +147,7 @@ class SegmentedRun:
             ValueError: as `stream_capture`.
         """
         check_outputs(self.out)
-        with locked_folder(self.out, "SegmentedRun.fit()"):
+        with locked_folder(self.out, "ChunkedRun.fit()"):
             folder = self.out / FOLDER
             if resume and not folder.exists() and (reports := self._complete()):
                 return reports
@@ -158,10 +158,10 @@ class SegmentedRun:
                 self._fit_side_by_side(self._begun(Progress(self.on_stage)))
             return self._joined(FitFiles.of(self.out))
 
-    def _begun(self, progress: Progress) -> list[Segment]:
-        """Return the segments after the common model, which is fitted if it is missing."""
-        segments = [self._earlier(start, stop) for start, stop in pairwise(self.starts)]
-        first = segments[0]
+    def _begun(self, progress: Progress) -> list[Chunk]:
+        """Return the chunks after the common model, which is fitted if it is missing."""
+        chunks = [self._earlier(start, stop) for start, stop in pairwise(self.starts)]
+        first = chunks[0]
         stop = min(COMMON_FRAMES, first.stop)
         prepared = None
         if not first.frame:
@@ -181,39 +181,37 @@ class SegmentedRun:
                 report = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
                 part = replace(part, reports=(report, *part.reports[1:]))
             self.add_part(part)
-            first = replace(part.segment, stop=first.stop)
+            first = replace(part.chunk, stop=first.stop)
         self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
         states = StreamReader(self._files(0).stream).states(stop - 1)
         common = next(state for state in states if state.frame == stop - 1)
         restart = (reemitted_keyframe(common).encoded,)
-        return [first, *(s if s.restart else replace(s, restart=restart) for s in segments[1:])]
+        return [first, *(s if s.restart else replace(s, restart=restart) for s in chunks[1:])]
 
-    def _fit_side_by_side(self, segments: Iterable[Segment]) -> None:
-        """Fit what is missing of segments. Each worker continues the loop of one of them, until it
+    def _fit_side_by_side(self, chunks: Iterable[Chunk]) -> None:
+        """Fit what is missing of chunks. Each worker continues the loop of one of them, until it
         is fitted.
         """
         from distributed import as_completed
 
-        queue = (segment for segment in segments if segment.frame < segment.stop)
+        queue = (chunk for chunk in chunks if chunk.frame < chunk.stop)
         begun = self._submitted(islice(queue, num_workers(self.client)))
         tasks = as_completed(begun, loop=self.client.loop)
         for future in tasks:
             part = future.result()
             self.add_part(part)
-            if part.segment.frame < part.segment.stop:
-                tasks.update(self._submitted([part.segment], part.worker))
+            if part.chunk.frame < part.chunk.stop:
+                tasks.update(self._submitted([part.chunk], part.worker))
             idle = max(1, num_workers(self.client)) - tasks.count()
             tasks.update(self._submitted(islice(queue, max(0, idle))))
 
-    def _submitted(
-        self, segments: Iterable[Segment], worker: str | None = None
-    ) -> list[Future[Part]]:
-        """Return the tasks of the next frames of segments, if possible on a worker."""
-        segments = list(segments)
-        stops = [min(segment.frame + TASK_FRAMES, segment.stop) for segment in segments]
+    def _submitted(self, chunks: Iterable[Chunk], worker: str | None = None) -> list[Future[Part]]:
+        """Return the tasks of the next frames of chunks, if possible on a worker."""
+        chunks = list(chunks)
+        stops = [min(chunk.frame + TASK_FRAMES, chunk.stop) for chunk in chunks]
         place = {} if worker is None else {"workers": worker, "allow_other_workers": True}
         return self.client.map(
-            fit_frames, len(segments) * [self.task], segments, stops, pure=False, **place
+            fit_frames, len(chunks) * [self.task], chunks, stops, pure=False, **place
         )
 
     def _use(self, capture: Capture) -> None:
@@ -224,26 +222,26 @@ class SegmentedRun:
             self.metadata |= about_lenses(capture)
 
     def _files(self, start: int) -> FitFiles:
-        """Return stream and report of the segment that begins with a frame."""
+        """Return stream and report of the chunk that begins with a frame."""
         return FitFiles(self.out / FOLDER / f"{start}.morgs", self.out / FOLDER / f"{start}.json")
 
-    def _earlier(self, start: int, stop: int) -> Segment:
-        """Return a segment as an interrupted fit left it."""
+    def _earlier(self, start: int, stop: int) -> Chunk:
+        """Return a chunk as an interrupted fit left it."""
         earlier = interrupted_fit(self._files(start), self.capture, self.metadata, start)
         if earlier is None:
-            return Segment(start, stop, start)
+            return Chunk(start, stop, start)
         self._open(start, earlier)
         restart = restart_of(earlier.previous_state, earlier.last)
-        return Segment(start, stop, start + len(earlier.reports), restart)
+        return Chunk(start, stop, start + len(earlier.reports), restart)
 
     def _open(self, start: int, earlier: Interrupted | None) -> None:
-        """Open the files of a segment."""
+        """Open the files of a chunk."""
         recording = Recording(self._files(start), self.capture, self.metadata, earlier)
         self.recordings[start] = self.open_files.enter_context(recording)
 
     def add_part(self, part: Part) -> None:
-        """Add the frames of a task to the files of their segment."""
-        start = part.segment.start
+        """Add the frames of a task to the files of their chunk."""
+        start = part.chunk.start
         if start not in self.recordings:
             self._open(start, None)
         self.recordings[start].extend(map(decode_packet, part.packets), part.reports)
@@ -270,7 +268,7 @@ class SegmentedRun:
         return read_reports(self.out / REPORT, range(frames))
 
     def _joined(self, files: FitFiles) -> list[FrameReport]:
-        """Join the segments into one stream with its report."""
+        """Join the chunks into one stream with its report."""
         starts = self.starts[:-1]
         reports = [report for start in starts for report in self.recordings[start].reports]
         new = files.next

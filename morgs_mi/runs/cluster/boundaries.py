@@ -1,6 +1,6 @@
-"""Seams: where a segment of a recording begins, and the stream continues with other Gaussians.
+"""Boundaries: starts of chunks, where the stream continues with other Gaussians.
 
-All segments start from one common model, the first two frames of the recording. A segment is fitted
+All chunks start from one common model, the first two frames of the recording. A chunk is fitted
 from some frames before its first one (*overlap*). The first of these is fitted like a later frame
 of the common model, several times over, until Gaussians that have travelled far since then arrive;
 the others follow as usual. What has not changed since the first frames stays as it is, to the bit.
@@ -36,11 +36,11 @@ _OVERLAP_EPOCHS = 2
 
 
 @config_class
-class SegmentConfig:
-    """Segments of a fit, and the seams between them."""
+class ChunkConfig:
+    """Chunks of a fit, and the boundaries between them."""
 
     count: int = 1
-    """Number of segments of about the same length, of two frames at least; with one, the stream
+    """Number of chunks of about the same length, of two frames at least; with one, the stream
     equals `stream_capture`'s."""
     passes: Annotated[int, Ge(1)] = 24
     """Fits of the first frame of the overlap, one after the other, each with a round of density
@@ -49,7 +49,7 @@ class SegmentConfig:
     epochs: Annotated[int, Ge(1)] = 4
     """Passes over all training views in each of them."""
     overlap: Annotated[int, Ge(0)] = 10
-    """Frames before a segment that are fitted as well: its Gaussians then follow the recording from
+    """Frames before a chunk that are fitted as well: its Gaussians then follow the recording from
     its first frame.
     """
 
@@ -70,12 +70,12 @@ class SegmentConfig:
         return replace(config, fit=fit, seed=config.seed + number)
 
 
-def fit_seam_frame(
+def fit_boundary_frame(
     setup: Setup,
     common: StreamState,
     frame: int,
     images: Sequence[np.ndarray | None],
-    config: SegmentConfig,
+    config: ChunkConfig,
 ) -> tuple[CodedFrame, FrameReport]:
     """Fit a frame far from the common model, and return its state and its report.
 
