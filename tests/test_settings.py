@@ -13,7 +13,6 @@ from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
 from morgs_mi import Camera
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import encode_packet
 from morgs_mi.core.config import types_of
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
@@ -155,7 +154,7 @@ def image(
 def stream(clip, config: StreamConfig) -> bytes:
     views, points, colors, frames = clip
     loop = StreamLoop(views, points, colors, config)
-    return b"".join(encode_packet(loop.push(images)[0]) for images in frames)
+    return b"".join(loop.push(images)[0].encoded for images in frames)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.codec.container import PacketKind, encode_packet
+from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, decode
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
@@ -184,7 +184,7 @@ def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
     fit = dataclasses.replace(QUICK.fit, density=density, first_frame_steps=40)
     config = dataclasses.replace(QUICK, fit=fit, render=RenderConfig(reproducible=True))
     dark = [clip[0], clip[1], [np.zeros_like(image) for image in clip[2]]]
-    runs = [[encode_packet(packet) for packet in run(frames, config)[1]] for frames in (clip, dark)]
+    runs = [[packet.encoded for packet in run(frames, config)[1]] for frames in (clip, dark)]
     assert runs[0][:2] == runs[1][:2]
     assert runs[0][2] != runs[1][2]
 
@@ -337,7 +337,7 @@ def test_push__without_any_image_nothing_moves(clip):
     assert report.status == "no view has an image"
     assert report.missing_views == ("cam00", "cam01", "cam02", "cam03")
     # The packet's frame, and nothing in it.
-    assert report.num_bytes < 200 < len(encode_packet(first))
+    assert report.num_bytes < 200 < len(first.encoded)
     for name, value in loop.gaussians.numpy().items():
         assert name == "motion" or np.array_equal(value, old_values[name]), name
     packet, report = loop.push(clip[1][:4])
@@ -728,7 +728,7 @@ def test_push__leaves_no_arrays_to_the_garbage_collection(clip):
 def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
     """Dr.Jit turns the interruption into a RuntimeError; the loop is as it was before the frame."""
     loop, other = (StreamLoop(cameras()[:4], *points_and_colors(), REPRODUCIBLE) for _ in range(2))
-    packets = [encode_packet(other.push(images[:4])[0]) for images in clip[:2]]
+    packets = [other.push(images[:4])[0].encoded for images in clip[:2]]
     first, _ = loop.push(clip[0][:4])
 
     def interrupt(*_: object) -> None:
@@ -741,7 +741,7 @@ def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("morgs_mi.render.compositing._Blend.backward", interrupt)
         assert garbage_of(interrupted) == []
-    assert [encode_packet(first), encode_packet(loop.push(clip[1][:4])[0])] == packets
+    assert [first.encoded, loop.push(clip[1][:4])[0].encoded] == packets
 
 
 @pytest.mark.slow

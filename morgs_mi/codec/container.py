@@ -1,16 +1,20 @@
 """The container of the stream: packets that are checked and appended one by one, and readable while
 they are written.
 
-    stream  = magic [8], version uint32, packet*
-    packet  = kind uint32, frame uint32, length uint64, crc uint32, payload [length]
-    payload = table length uint32, table, the arrays' bytes
-    table   = JSON: name, dtype and shape of each array
+    stream    = "MORGS-MI" version:u32 header (keyframe | residual | index)*
+    header    = packet of kind 0, payload: JSON of the cameras, frame rate and metadata
+    keyframe  = packet of kind 1, payload: arrays of the whole state
+    residual  = packet of kind 2, payload: arrays of the changes since the frame before
+    index     = packet of kind 3, payload: entry* offset:u64 "MORGSIDX"
 
-All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet
-0 is the header, with a payload of JSON alone: cameras, frame rate and free metadata. A stream that
-was closed ends with an index: (kind uint32, frame uint32, offset uint64) of each packet except the
-header, then its own offset uint64 and a magic [8]. `codec.packets` defines the arrays;
-docs/stream-format.md specifies everything.
+    packet    = kind:u32 frame:u32 length:u64 crc:u32 payload[length]
+    arrays    = length:u32 table[length] bytes of the arrays, one after the other
+    table     = JSON [[name, dtype, shape], ...]
+    entry     = kind:u32 frame:u32 offset:u64 of each packet before, except the header
+
+All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. A
+stream that was closed ends with an index, whose offset is its own. `codec.packets` defines the
+arrays; docs/stream-format.md specifies everything.
 """
 
 from __future__ import annotations
@@ -42,7 +46,7 @@ ENTRY = struct.Struct("<IIQ")  # kind, frame, offset
 TRAILER = struct.Struct("<Q8s")
 _U32 = struct.Struct("<I")
 PAYLOAD = HEAD.size + _U32.size  # offset of the payload in a packet
-_DTYPES = ("float32", "uint32", "uint8")
+_DTYPES = {"float32": "<f4", "uint32": "<u4", "uint8": "u1"}
 _MAX_TABLE = 2**16  # bytes
 _MAX_AXES = 8
 
@@ -54,6 +58,9 @@ class PacketKind(IntEnum):
     KEYFRAME = 1
     RESIDUAL = 2
     INDEX = 3
+
+
+_KINDS = (PacketKind.KEYFRAME, PacketKind.RESIDUAL)  # of frames
 
 
 class TruncatedStreamError(ValueError):
@@ -90,22 +97,16 @@ class Packet:
             ValueError: the kind is not `KEYFRAME` or `RESIDUAL`, the frame is not a uint32, or an
                 array has another dtype.
         """
-        if self.kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
+        dtypes = {array.dtype.name for array in self.arrays.values()}
+        if self.kind not in _KINDS or not 0 <= self.frame < 2**32 or dtypes - _DTYPES.keys():
             raise ValueError(
-                f"Packet.encoded: `kind` must be KEYFRAME or RESIDUAL, got {self.kind!r}."
+                "Packet.encoded: expected a keyframe or residual of a frame in 0..2^32-1 with "
+                f"arrays of {', '.join(_DTYPES)}, got {self!r} of {', '.join(dtypes)}."
             )
-        if not 0 <= self.frame < 2**32:
-            raise ValueError(f"Packet.encoded: `frame` must be in 0..2^32-1, got {self.frame}.")
-        rows = []
-        contents = []
-        for name, array in self.arrays.items():
-            if array.dtype.name not in _DTYPES:
-                raise ValueError(
-                    f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got "
-                    f"{array.dtype}; convert it."
-                )
-            rows.append([name, array.dtype.name, array.shape])
-            contents.append(array.astype(array.dtype.newbyteorder("<")).tobytes())
+        rows = [[name, array.dtype.name, array.shape] for name, array in self.arrays.items()]
+        contents = [
+            array.astype(_DTYPES[array.dtype.name]).tobytes() for array in self.arrays.values()
+        ]
         table = json.dumps(rows).encode()
         payload = b"".join([_U32.pack(len(table)), table, *contents])
         return _sealed(self.kind, self.frame, payload)
@@ -116,29 +117,34 @@ class Packet:
         return len(self.encoded)
 
 
-def encode_packet(packet: Packet) -> bytes:
-    """Return `packet.encoded`, the inverse of `decode_packet`.
-
-    Raises:
-        ValueError: the packet cannot be encoded.
-    """
-    return packet.encoded
-
-
 def decode_packet(data: bytes, place: str = "") -> Packet:
-    """Return the packet with the encoding `data`; `place` describes where it was read, for
+    """Return the packet that is `encoded` as `data`; `place` describes where it was read, for
     messages.
 
     Raises:
         ValueError: the bytes are not exactly one intact keyframe or residual packet.
     """
     kind, frame, payload = open_packet(data)
-    if kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
+    if kind not in _KINDS:
         raise ValueError(f"the kind must be 1 (keyframe) or 2 (residual), got {kind}")
+    arrays: dict[str, np.ndarray] = {}
     try:
-        return Packet(PacketKind(kind), frame, _arrays(payload), place)
-    except (struct.error, ValueError) as error:
+        (length,) = _U32.unpack_from(payload)
+        at = _U32.size + length
+        for name, dtype, shape in load_json(payload[_U32.size : at], _MAX_TABLE):
+            is_name = isinstance(name, str) and name not in arrays
+            is_shape = isinstance(shape, list) and len(shape) <= _MAX_AXES
+            if not is_name or not is_shape or any(type(n) is not int or n < 0 for n in shape):
+                raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
+            stored_dtype = np.dtype(_DTYPES[dtype])
+            end = at + math.prod(shape) * stored_dtype.itemsize
+            arrays[name] = np.frombuffer(payload[at:end], stored_dtype).reshape(shape).astype(dtype)
+            at = end
+        if at != len(payload):
+            raise ValueError(f"it describes {at} bytes of {len(payload)}")
+    except (struct.error, KeyError, TypeError, OverflowError, ValueError) as error:
         raise ValueError(f"its table of arrays is broken ({error})") from None
+    return Packet(PacketKind(kind), frame, arrays, place)
 
 
 class StreamWriter:
@@ -167,17 +173,11 @@ class StreamWriter:
         payload = header_json(cameras, fps, metadata or {}).encode()
         self.num_bytes = 0
         self._index: list[tuple[int, int, int]] | None = []
-        self._file: BinaryIO
-        if isinstance(sink, str | Path):
-            # Unbuffered: a buffer would write its rest again after a failed packet has been
-            # removed.
-            self.path = Path(sink)
-            self._owns_file = True
-            self._file = open(sink, "wb", buffering=0)  # noqa: SIM115
-        else:
-            self.path = Path(str(getattr(sink, "name", "stream")))
-            self._owns_file = False
-            self._file = sink
+        is_path = isinstance(sink, str | Path)
+        self._owns_file = is_path
+        self.path = Path(sink if is_path else str(getattr(sink, "name", "stream")))
+        # Unbuffered: a buffer would write its rest again after a failed packet has been removed.
+        self._file = open(sink, "wb", buffering=0) if is_path else sink  # noqa: SIM115
         try:
             self._append(PREAMBLE.pack(MAGIC, VERSION) + _sealed(PacketKind.HEADER, 0, payload))
         except OSError:
@@ -278,13 +278,12 @@ def open_packet(data: bytes) -> tuple[int, int, memoryview]:
     Raises:
         ValueError: its length or its CRC is wrong.
     """
-    if len(data) < PAYLOAD:
-        raise ValueError(f"a packet has at least {PAYLOAD} bytes, got {len(data)}")
     head = data[: HEAD.size]
+    length = HEAD.unpack(head)[2] if len(data) >= PAYLOAD else 0
+    if len(data) != PAYLOAD + length:
+        raise ValueError(f"a packet should have {PAYLOAD + length} bytes, got {len(data)}")
     payload = memoryview(data)[PAYLOAD:]
-    kind, frame, length = HEAD.unpack(head)
-    if length != len(payload):
-        raise ValueError(f"its payload should have {length} bytes, got {len(payload)}")
+    kind, frame, _ = HEAD.unpack(head)
     (stated_crc,) = _U32.unpack_from(data, HEAD.size)
     crc = _crc(head, payload)
     if crc != stated_crc:
@@ -296,35 +295,3 @@ def open_packet(data: bytes) -> tuple[int, int, memoryview]:
 
 def _crc(head: bytes, payload: bytes | memoryview) -> int:
     return zlib.crc32(payload, zlib.crc32(head))
-
-
-def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
-    """Return the arrays of a payload, in this machine's byte order."""
-    (length,) = _U32.unpack_from(payload)
-    at = _U32.size + length
-    table = load_json(payload[_U32.size : at], _MAX_TABLE)
-    if not isinstance(table, list) or any(
-        not isinstance(row, list) or len(row) != 3 for row in table
-    ):
-        raise ValueError("it must be a list of [name, dtype, shape]")
-    for name, dtype, shape in table:
-        is_shape = (
-            isinstance(shape, list)
-            and len(shape) <= _MAX_AXES
-            and all(type(n) is int and 0 <= n < 2**63 for n in shape)
-        )
-        if not isinstance(name, str) or dtype not in _DTYPES or not is_shape:
-            raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
-    if len({name for name, *_ in table}) < len(table):
-        raise ValueError("two arrays have one name")
-    arrays: dict[str, np.ndarray] = {}
-    for name, dtype, shape in table:
-        stored_dtype = np.dtype(dtype).newbyteorder("<")
-        end = at + math.prod(shape) * stored_dtype.itemsize
-        if end > len(payload):
-            raise ValueError(f"`{name}` {shape} would end at byte {end} of {len(payload)}")
-        arrays[name] = np.frombuffer(payload[at:end], stored_dtype).reshape(shape).astype(dtype)
-        at = end
-    if at != len(payload):
-        raise ValueError(f"it describes {at} bytes of {len(payload)}")
-    return arrays

@@ -16,20 +16,24 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST
+from morgs_mi.core.checks import LARGEST, bounded, numbers
 
 _MAX_BYTES = 2**22
 _MAX_LEVELS = 32  # of JSON; recursive programs must be able to visit it
 _MAX_PIXELS = 2**26  # of a camera
-_MAX_FPS = 1e6
-_IN_WORDS = {
-    dict: "an object",
-    list: "a list",
-    str: "a string",
-    int: "an integer",
-    float: "a number",
-    bool: "a truth value",
-    type(None): "null",
+# Type of each entry, least and largest number or length, and the same in words.
+_HEADER = {
+    "cameras": (list, 1, math.inf, "a list of at least one camera"),
+    "fps": (float, 1e-6, 1e6, "a number from 1e-6 to 1e6"),
+    "metadata": (dict, 0, math.inf, "an object"),
+}
+_CAMERA = {
+    "name": (str, 0, math.inf, "a string"),
+    "width": (int, 1, _MAX_PIXELS, "an integer from 1 to 2^26"),
+    "height": (int, 1, _MAX_PIXELS, "an integer from 1 to 2^26"),
+    "near": (float, 1 / LARGEST, LARGEST, "a number from 1e-12 to 1e12"),
+    "K": (list, 3, 3, "three lists of three numbers"),
+    "viewmat": (list, 4, 4, "four lists of four numbers"),
 }
 
 
@@ -56,13 +60,8 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     }
     try:
         text = json.dumps(fields, allow_nan=False)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(
-            f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error})."
-        ) from None
-    try:
         header_fields(text.encode())
-    except ValueError as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"StreamWriter(): a reader would refuse the header: {error}.") from None
     return text
 
@@ -73,15 +72,9 @@ def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], floa
     Raises:
         ValueError: an entry is missing, or has another type or range than it must have.
     """
-    header = _typed(load_json(payload, _MAX_BYTES), dict, "header")
-    cameras = [
-        camera_of_fields(fields, f"cameras[{k}]")
-        for k, fields in enumerate(_entry(header, "cameras", list))
-    ]
-    if not cameras:
-        raise ValueError("`cameras` must name at least one camera, got none")
-    fps = _within(_entry(header, "fps", float), 1 / _MAX_FPS, _MAX_FPS, "fps")
-    return tuple(cameras), fps, _entry(header, "metadata", dict)
+    cameras, fps, metadata = _entries(load_json(payload, _MAX_BYTES), _HEADER)
+    views = (camera_of_fields(fields, f"cameras[{k}]") for k, fields in enumerate(cameras))
+    return tuple(views), fps, metadata
 
 
 def load_json(data: bytes | memoryview, most: int) -> Any:
@@ -95,42 +88,33 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
         ValueError: it is longer, nested too deeply or no JSON, or has numbers that are not finite
             or, if they are integers, have more than 64 bits.
     """
-    if len(data) > most:
-        raise ValueError(f"the JSON must have at most {most} bytes, got {len(data)}")
-    too_deep = f"the JSON must be nested at most {_MAX_LEVELS} levels deep"
     try:
-        value = json.loads(
-            str(data, "utf-8"), parse_constant=_finite, parse_float=_finite, parse_int=_short
-        )
-    except UnicodeDecodeError:
-        raise ValueError("the JSON is broken (not UTF-8)") from None
-    except json.JSONDecodeError as error:
+        if len(data) > most:
+            raise ValueError(f"it must have at most {most} bytes, got {len(data)}")
+        text = str(data, "utf-8")
+        value = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_number)
+        if _levels(value) > _MAX_LEVELS:
+            raise ValueError(f"it must be nested at most {_MAX_LEVELS} levels deep")
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"the JSON is broken ({error})") from None
-    except RecursionError:
-        raise ValueError(too_deep) from None
-    level = [value]
-    for _ in range(_MAX_LEVELS):
-        parents = [parent for parent in level if isinstance(parent, dict | list)]
-        level = [
-            child
-            for parent in parents
-            for child in (parent.values() if isinstance(parent, dict) else parent)
-        ]
-    if level:
-        raise ValueError(too_deep)
     return value
 
 
-def _finite(text: str) -> float:
-    if not math.isfinite(value := float(text)):
-        raise ValueError(f"numbers must be finite, got {text[:40]}")
-    return value
+def _number(text: str) -> float:
+    """Return a finite number, or an integer of at most 64 bits."""
+    number = int(text) if text.lstrip("-").isdecimal() else float(text)
+    is_short = -(2**63) <= number < 2**64 if isinstance(number, int) else math.isfinite(number)
+    if not is_short:
+        raise ValueError(f"numbers must be finite, integers of at most 64 bits, got {text:.40}")
+    return number
 
 
-def _short(text: str) -> int:
-    if len(text) > 20 or not -(2**63) <= (value := int(text)) < 2**64:
-        raise ValueError(f"integers must have at most 64 bits, got {text[:40]}")
-    return value
+def _levels(value: Any) -> int:
+    """Return how deeply a JSON value is nested."""
+    if not isinstance(value, dict | list):
+        return 0
+    children = value.values() if isinstance(value, dict) else value
+    return 1 + max(map(_levels, children), default=0)
 
 
 def camera_of_fields(fields: Any, where: str) -> Camera:
@@ -139,48 +123,31 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     Raises:
         ValueError: an entry is missing, or has another type or range than it must have.
     """
-    fields = _typed(fields, dict, where)
-    name = _entry(fields, "name", str, where)
-    if not name.isprintable():
-        raise ValueError(f"`{where}.name` must be printable, got {name!r:.60}")
-    width, height = (
-        _within(_entry(fields, key, int, where), 1, _MAX_PIXELS, f"{where}.{key}")
-        for key in ("width", "height")
-    )
-    _within(width * height, 1, _MAX_PIXELS, f"{where}.width * height")
-    near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
-    K = _matrix(fields, "K", 3, where)
-    viewmat = _matrix(fields, "viewmat", 4, where)
+    name, width, height, near, *rows = _entries(fields, _CAMERA, f"{where}.")
+    K, viewmat = (numbers(where, "matrix", matrix) for matrix in rows)
+    is_view = (K.shape, viewmat.shape) == ((3, 3), (4, 4)) and bounded(K) and bounded(viewmat)
+    if not is_view or not name.isprintable() or width * height > _MAX_PIXELS:
+        raise ValueError(
+            f"`{where}` must have a printable `name`, at most 2^26 pixels, and `K` [3][3] and "
+            f"`viewmat` [4][4] of at most {LARGEST:g}, got {name!r:.60}, {width}x{height}, "
+            f"{rows!s:.200}"
+        )
     return Camera(K, viewmat, width, height, name=name, near=near)
 
 
-def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarray:
-    rows = _entry(fields, key, list, where)
-    what = f"{where}.{key}"
-    if len(rows) != size or any(not isinstance(row, list) or len(row) != size for row in rows):
-        raise ValueError(f"`{what}` must be a matrix [{size}][{size}]")
-    return np.array(
-        [[_within(_typed(x, float, what), -LARGEST, LARGEST, what) for x in row] for row in rows]
-    )
-
-
-def _entry(fields: dict[str, Any], key: str, kind: type, where: str = "") -> Any:
-    name = f"{where}.{key}".lstrip(".")
-    if key not in fields:
-        raise ValueError(f"`{name}` is missing")
-    return _typed(fields[key], kind, name)
-
-
-def _typed(value: Any, kind: type, name: str) -> Any:
-    """Return a value of type `kind`; an integer is also a float, and a boolean is neither."""
-    if type(value) is int and kind is float:
-        return float(value)
-    if type(value) is not kind:
-        raise ValueError(f"`{name}` must be {_IN_WORDS[kind]}, got {_IN_WORDS[type(value)]}")
-    return value
-
-
-def _within(value: Any, low: float, high: float, name: str) -> Any:
-    if not low <= value <= high:
-        raise ValueError(f"`{name}` must lie between {low:.10g} and {high:.10g}, got {value:.10g}")
-    return value
+def _entries(
+    fields: Any, limits: Mapping[str, tuple[type, float, float, str]], where: str = ""
+) -> list[Any]:
+    """Return the entries of a JSON object in the order of their limits; an integer is also a float,
+    and a boolean is neither.
+    """
+    entries = []
+    for key, (kind, low, high, words) in limits.items():
+        value = fields.get(key) if isinstance(fields, dict) else None
+        if kind is float and type(value) is int:
+            value = float(value)
+        size: Any = len(value) if isinstance(value, dict | list | str) else value
+        if type(value) is not kind or not low <= size <= high:
+            raise ValueError(f"`{where}{key}` must be {words}, got {value!r:.60}")
+        entries.append(value)
+    return entries

@@ -13,6 +13,7 @@ birth. Survivors come first in ascending order, births after them. Each Gaussian
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,7 +35,6 @@ from morgs_mi.codec.quantisation import (
     num_exponents,
     num_integers,
     optional_mask,
-    optional_names,
     real_values,
     split_groups,
     stored_fields,
@@ -132,41 +132,23 @@ def residual_packet(
 
     Args:
         previous: state of the decoder, N Gaussians.
-        gaussians: N' Gaussians of the next frame; with `config.offset`, `offset` is stored where
-            the means change.
+        gaussians: N' Gaussians of the next frame with the same attributes; with `config.offset`,
+            `offset` is stored where the means change.
         source: int [N'], see above; None if there are no births and no deaths.
         cameras: cameras in which the error of births is measured.
         config: tolerated errors.
 
     Raises:
-        ValueError: `source` or the attributes do not fit, or an attribute is not finite.
+        ValueError: an attribute is not finite.
     """
     config = config or CodecConfig()
     grid = previous.grid
     N = len(grid)
-    degree = gaussians.sh_degree
-    optional = optional_mask(gaussians.items())
-    if (degree, optional) != (grid.degree, grid.optional):
-        raise ValueError(
-            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} "
-            f"and the optional attributes {list(optional_names(grid.optional))} as the frame "
-            f"before, got degree {degree} and {list(optional_names(optional))}; write a keyframe "
-            "instead."
-        )
     source = np.arange(N) if source is None else np.asarray(source)
-    is_birth = source < 0
-    survivors = source[~is_birth]
-    if (
-        source.shape != (len(gaussians),)
-        or not np.all(np.diff(survivors) > 0)
-        or np.any(np.diff(is_birth.astype(int)) < 0)
-        or np.any(survivors >= N)
-    ):
-        raise ValueError(
-            f"residual_packet(): `source` must be [{len(gaussians)}] with survivors of 0..{N - 1} "
-            f"in ascending order, then -1 for each birth, got {source.shape}; sort the Gaussians "
-            "in this order."
-        )
+    survivors = source[source >= 0]
+    attributes = (gaussians.sh_degree, optional_mask(gaussians.items()))
+    assert attributes == (grid.degree, grid.optional)
+    assert np.all(np.diff(survivors) > 0)
     fields = finite_fields(gaussians)
     groups = split_groups(fields)
 
@@ -183,8 +165,8 @@ def residual_packet(
     change -= grid.values[rows].T
     offset = None
     if config.offset:
-        has_offset = gaussians.offset is not None
-        offset = np.asarray(gaussians.offset) if has_offset else np.zeros((len(gaussians), 3))
+        zero = np.zeros((len(gaussians), 3))
+        offset = zero if gaussians.offset is None else np.asarray(gaussians.offset)
     coder = Coder(grid, survivors, rows, change, offset)
 
     births = len(gaussians) - len(survivors)
@@ -211,15 +193,13 @@ def _sized_codes(
     quantizer_step = round(4 * np.log2(config.birth_precision))
     if target:
         # The least quantizer step at which the changes are estimated to take `target` bytes.
-        high = _MAX_QUANTIZER_STEP
-        while quantizer_step < high:
-            middle = (quantizer_step + high) // 2
-            r = coder.rounded(middle)
-            bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, middle))))
-            if bits / 8 <= target:
-                high = middle
-            else:
-                quantizer_step = middle + 1
+        def fits(step: int) -> bool:
+            r = coder.rounded(step)
+            bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, step))))
+            return bits / 8 <= target
+
+        steps = range(_MAX_QUANTIZER_STEP)
+        quantizer_step = bisect_left(steps, True, quantizer_step, key=fits)
     codes = _codes(coder, quantizer_step, birth_grid)
     while (
         target
@@ -244,37 +224,33 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
     """
     where = packet.place or f"packet of frame {packet.frame}"
     try:
-        return _next_state(previous, packet)
+        is_residual = packet.kind == PacketKind.RESIDUAL
+        expected = {"head": "uint32 [n]", "code": "uint32 [n]"}
+        if is_residual:
+            expected |= {"parent": "uint8 [n]"}
+            expected |= {"offset": "uint32 [n]"} if "offset" in packet.arrays else {}
+        arrays = {
+            name: f"{array.dtype} {'[n]' if array.ndim == 1 else list(array.shape)}"
+            for name, array in packet.arrays.items()
+        }
+        if arrays != expected:
+            raise ValueError(f"expected the arrays {expected}, got {arrays}")
+        if previous is not None and packet.frame <= previous.frame:
+            raise ValueError(
+                f"its frame must be above {previous.frame}, the frame of the state, got "
+                f"{packet.frame}"
+            )
+        if not is_residual:
+            first_id = 0 if previous is None else previous.first_id + max(previous.next_id, 1)
+            return _decoded_keyframe(packet, first_id)
+        if previous is None or not np.array_equal(packet.arrays["parent"], previous.digest):
+            state = "a state" if previous is None else f"the state after frame {previous.frame}"
+            raise ValueError(
+                f"it does not continue {state}; a packet is missing, start from a keyframe"
+            )
+        return _decoded_residual(previous, packet)
     except ValueError as error:
         raise ValueError(f"{where}: {error}.") from None
-
-
-def _next_state(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
-    """Return the state after a packet, if it may follow on `previous`."""
-    is_residual = packet.kind == PacketKind.RESIDUAL
-    names = {"head", "code", "parent"} if is_residual else {"head", "code"}
-    optional = {"offset"} if is_residual else set()
-    if packet.arrays.keys() - optional != names:
-        raise ValueError(f"expected the arrays {sorted(names)}, got {sorted(packet.arrays)}")
-    for name, array in packet.arrays.items():
-        if array.ndim != 1 or array.dtype != _DTYPES[name]:
-            raise ValueError(
-                f"`{name}` must be {_DTYPES[name]} [n], got {array.dtype} {list(array.shape)}"
-            )
-    if previous is not None and packet.frame <= previous.frame:
-        raise ValueError(
-            f"its frame must be above {previous.frame}, the frame of the state, got {packet.frame}"
-        )
-    if packet.kind == PacketKind.KEYFRAME:
-        first_id = 0 if previous is None else previous.first_id + max(previous.next_id, 1)
-        return _decoded_keyframe(packet, first_id)
-    if previous is None:
-        raise ValueError("a residual needs the frame before it, got none; start from a keyframe")
-    if not np.array_equal(packet.arrays["parent"], previous.digest):
-        raise ValueError(
-            f"it does not continue the state after frame {previous.frame}; a packet is missing"
-        )
-    return _decoded_residual(previous, packet)
 
 
 def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
@@ -287,16 +263,9 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
 
 
 def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
+    limits = {"N": 2**32 - 1, "degree": 3, "optional": KNOWN_OPTIONAL, "next_id": LIMIT - 1}
+    N, degree, optional, next_id = _head(packet, limits)
     code = packet.arrays["code"]
-    N, degree, optional, next_id = _head(packet, 4)
-    if unknown_bits := optional & ~KNOWN_OPTIONAL:
-        raise ValueError(
-            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got "
-            f"{optional:#b} with the unknown {unknown_bits:#b}; read it with the release that "
-            "wrote it"
-        )
-    _check_most(degree, 3, "its degree")
-    _check_most(next_id, LIMIT - 1, "its next id")
     _check_words(code, N, N, degree, optional)
     reader = ColumnReader(code)
     ids = np.cumsum(reader.take(N) + 1) - 1
@@ -309,9 +278,9 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
-    births, quantizer_step = _head(packet, 2)
-    _check_most(quantizer_step, _MAX_QUANTIZER_STEP, "its quantizer step")
-    _check_most(previous.next_id + births, LIMIT - 1, "its next id")
+    most_births = LIMIT - 1 - previous.next_id
+    limits = {"births": most_births, "quantizer_step": _MAX_QUANTIZER_STEP}
+    births, quantizer_step = _head(packet, limits)
     code = packet.arrays["code"]
     grid = previous.grid
     reader = ColumnReader(code)
@@ -345,6 +314,19 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     )
 
 
+def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
+    E = num_exponents(optional)
+    shifts = reader.take(num_integers(degree, optional))
+    largest = np.empty((N, 1), np.uint8)
+    exponents = np.empty((N, E), np.int8)
+    values = np.empty((N, len(shifts) - 1 - E), np.int32)
+    columns = chain(largest.T, exponents.T, values.T)
+    limits = [(0, 3), *[(-128, 127)] * E, *[(-LIMIT, LIMIT - 1)] * values.shape[1]]
+    for column, shift, (low, high) in zip(columns, shifts, limits, strict=True):
+        column[:] = bounded(reader.take(N) + shift, low, high)
+    return Grid(values, exponents, largest[:, 0], degree, optional)
+
+
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     columns = np.concatenate(
         [grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64
@@ -357,27 +339,6 @@ def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     # Small integers have a token of their own, large ones one per octave.
     for column in (columns - middle).T:
         writer.put(column)
-
-
-def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
-    first = 1 + num_exponents(optional)  # column of the values
-    middle = reader.take(num_integers(degree, optional))
-    largest = reader.take(N) + middle[0]
-    if np.any((largest < 0) | (largest > 3)):
-        raise ValueError("the largest component of a quaternion must be 0 to 3")
-    exponents = np.empty((N, first - 1), np.int8)
-    values = np.empty((N, len(middle) - first), np.int32)
-    _fill(exponents, reader, middle[1:first], 128, "exponent")
-    _fill(values, reader, middle[first:], LIMIT, "value")
-    return Grid(values, exponents, largest.astype(np.uint8), degree, optional)
-
-
-def _fill(
-    columns: np.ndarray, reader: ColumnReader, shifts: np.ndarray, limit: int, what: str
-) -> None:
-    """Read values into the columns [N, C], and add the shift of each column."""
-    for column, shift in zip(columns.T, shifts, strict=True):
-        column[:] = bounded(reader.take(len(columns)) + shift, limit, what)
 
 
 def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
@@ -399,16 +360,15 @@ def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid | None) -> dict[s
     return codes
 
 
-def _head(packet: Packet, count: int) -> list[int]:
-    head = packet.arrays["head"]
-    if head.shape != (count,):
-        raise ValueError(f"its head must have {count} numbers, got {list(head.shape)}")
-    return [int(number) for number in head]
-
-
-def _check_most(number: int, most: int, what: str) -> None:
-    if number > most:
-        raise ValueError(f"{what} must be at most {most}, got {number}")
+def _head(packet: Packet, limits: dict[str, int]) -> list[int]:
+    """Return the numbers in the head of a packet, each of which has a limit."""
+    head = packet.arrays["head"].tolist()
+    if len(head) != len(limits) or np.any(np.greater(head, [*limits.values()])):
+        raise ValueError(
+            f"its head must have numbers of at most {limits}, got {head}; read it with the release "
+            "that wrote it"
+        )
+    return head
 
 
 def _padded(words: np.ndarray, births: int, total: int, grid: Grid) -> np.ndarray:

@@ -207,14 +207,14 @@ def step_sizes(exponents: np.ndarray) -> np.ndarray:
     return _STEPS[exponents.astype(np.uint8)]
 
 
-def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
-    """Return integers that lie in -limit..limit - 1.
+def bounded(values: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Return integers that lie in low..high.
 
     Raises:
         ValueError: they do not.
     """
-    if np.any((values >= limit) | (values < -limit)):
-        raise ValueError(f"each {what} must lie between -{limit} and {limit}")
+    if np.any((values < low) | (values > high)):
+        raise ValueError(f"its integers must lie between {low} and {high}")
     return values
 
 

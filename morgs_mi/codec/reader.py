@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -31,7 +30,7 @@ from morgs_mi.codec.header import header_fields
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.core.bounded import open_regular
 
-_CHUNK = 2**20
+_READ_SIZE = 2**20
 
 _Entry = tuple[int, int, int]
 
@@ -70,22 +69,16 @@ class StreamReader(FrameSource):
         self, source: str | Path | BinaryIO, skip_damaged: bool = False, follow: bool = True
     ) -> None:
         self._follow = follow
-        self._pipe = None if isinstance(source, str | Path) else source
-        self.path = Path(
-            source if isinstance(source, str | Path) else str(getattr(source, "name", "stream"))
-        )
+        is_path = isinstance(source, str | Path)
+        self._pipe = None if is_path else source
+        self.path = Path(source if is_path else str(getattr(source, "name", "stream")))
         with self._opened() as file:
             preamble = _read(file, PREAMBLE.size)
-            if not MAGIC.startswith(preamble[:8]):
+            if not PREAMBLE.pack(MAGIC, VERSION).startswith(preamble):
                 raise ValueError(
-                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got "
-                    f"{preamble[:8]!r}; check the path."
-                )
-            version = PREAMBLE.unpack(preamble)[1] if len(preamble) == PREAMBLE.size else VERSION
-            if version != VERSION:
-                raise ValueError(
-                    f"{self.path}: expected format version {VERSION}, got {version}; "
-                    "read it with the release that wrote it."
+                    f"{self.path}: expected a stream that starts with {MAGIC!r} and version "
+                    f"{VERSION}, got {preamble!r}; check the path, or read it with the release "
+                    "that wrote it."
                 )
             data = self._packet(file, 0, len(preamble))
         if data is None:
@@ -146,7 +139,6 @@ class StreamReader(FrameSource):
             TruncatedStreamError: as `index`.
             ValueError: it is a pipe, which cannot seek, or a packet is broken.
         """
-        self._check_is_file("to seek in")
         number = 1
         at = self._first
         for k, (kind, packet_frame, offset) in enumerate(self.index(), start=1):
@@ -162,7 +154,7 @@ class StreamReader(FrameSource):
         Raises:
             TruncatedStreamError: as `index`.
         """
-        with open_regular(self.path, self._follow) as file:
+        with self._file() as file:
             return self._last_index(file) is not None
 
     def index(self) -> list[_Entry]:
@@ -173,10 +165,11 @@ class StreamReader(FrameSource):
 
         Raises:
             TruncatedStreamError: the file is now shorter than the header that was read from it.
+            ValueError: it is a pipe.
         """
         if self._playable_entries is not None:
             return list(self._playable_entries)
-        with open_regular(self.path, self._follow) as file:
+        with self._file() as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
             entries = []
@@ -192,19 +185,14 @@ class StreamReader(FrameSource):
                 at += PAYLOAD + length
             return entries
 
-    def _check_is_file(self, use: str) -> None:
-        if self._pipe is not None:
-            raise ValueError(f"{self.path}: expected a file {use}, got a pipe; save it first.")
-
     def _playable(self) -> tuple[list[_Entry], list[int]]:
         """Return the entries of the packets that play without the damaged ones, and the frames that
         do not play.
         """
-        self._check_is_file("to skip damage in")
         entries = list[_Entry]()
         frames = [-1]
         plays = False
-        with open_regular(self.path, self._follow) as file:
+        with self._file() as file:
             for number, (kind, frame, offset) in enumerate(self.index(), start=1):
                 file.seek(offset)
                 try:
@@ -240,12 +228,11 @@ class StreamReader(FrameSource):
             entries = list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
         except (ValueError, struct.error):  # a payload that looks like an index by chance
             return None
-        kinds = {kind for kind, *_ in entries}
         offsets = [self._first - 1, *(offset for *_, offset in entries), at]
         is_index = (
             packet_kind == PacketKind.INDEX
-            and kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL}
-            and all(a < b for a, b in pairwise(offsets))
+            and all(kind in (PacketKind.KEYFRAME, PacketKind.RESIDUAL) for kind, *_ in entries)
+            and offsets == sorted(set(offsets))
         )
         return entries if is_index else None
 
@@ -256,61 +243,48 @@ class StreamReader(FrameSource):
         An index at the file's end, and a packet that is truncated there, lie after that byte.
 
         Raises:
-            ValueError: it is a pipe, or a packet is broken.
+            ValueError: a packet is broken.
         """
-        self._check_is_file("that is read twice")
         entries = []
         end = self._first
         with contextlib.suppress(TruncatedStreamError):
-            for at, data in self._checked(1, self._first):
+            for _, at, data in self._checked(1, self._first):
                 kind, frame, _ = HEAD.unpack_from(data)
-                if kind != PacketKind.INDEX:
-                    entries.append((kind, frame, at))
-                    end = at + len(data)
+                entries.append((kind, frame, at))
+                end = at + len(data)
         return entries, end
 
     def _packets(self, number: int, at: int) -> Iterator[Packet]:
-        last = None
-        read = self._checked if self._playable_entries is None else self._undamaged
-        for offset, data in read(number, at):
-            if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
-                with self._located(number, offset, last):
-                    packet = decode_packet(data, self._place(number, offset))
-                yield packet
-                number += 1
-                last = packet.frame
+        for packet_number, offset, data in self._checked(number, at):
+            with self._located(packet_number, offset):
+                packet = decode_packet(data, self._place(packet_number, offset))
+            yield packet
 
-    def _undamaged(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
-        """Yield (offset, bytes) of the packets that are not left out, from byte `at` on."""
-        with open_regular(self.path, self._follow) as file:
-            for *_, offset in self.index():
-                if offset >= at:
-                    file.seek(offset)
-                    data = self._packet(file, number, offset) or b""
-                    with self._located(number, offset):  # it may have been replaced
-                        open_packet(data)
-                    yield offset, data
-                    number += 1
+    def _checked(self, number: int, at: int) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (number, offset, bytes) of every packet with a correct CRC that is not left out,
+        from packet `number` at byte `at` on.
 
-    def _checked(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
-        """Yield (offset, bytes) of every packet with a correct CRC, from packet `number` at byte
-        `at` on.
-
-        There may be an index between packets, if a stream was closed and continued; it has no
-        number.
+        There may be an index between packets, if a stream was closed and continued; it is skipped
+        and has no number.
         """
         with self._opened() as file:
-            if self._pipe is None:
-                file.seek(at)
             last = None
-            while (data := self._packet(file, number, at, last)) is not None:
+            entries = self._playable_entries
+            offsets = iter([offset for *_, offset in entries or () if offset >= at])
+            while True:
+                if entries is not None:
+                    at = next(offsets, file.seek(0, 2))
+                if self._pipe is None:
+                    file.seek(at)
+                if (data := self._packet(file, number, at, last)) is None:
+                    return
                 with self._located(number, at, last):
                     kind, frame, _ = open_packet(data)
-                yield at, data
-                at += len(data)
                 if kind != PacketKind.INDEX:
+                    yield number, at, data
                     number += 1
                     last = frame
+                at += len(data)
 
     def _packet(
         self, file: BinaryIO, number: int, at: int, last: int | None = None
@@ -326,13 +300,18 @@ class StreamReader(FrameSource):
             raise TruncatedStreamError(self._sentence(number, at, problem, last))
         return data
 
-    @contextlib.contextmanager
-    def _opened(self) -> Iterator[BinaryIO]:
+    def _file(self) -> BinaryIO:
+        """Open the file.
+
+        Raises:
+            ValueError: it is a pipe, which cannot seek.
+        """
         if self._pipe is not None:
-            yield self._pipe
-        else:
-            with open_regular(self.path, self._follow) as file:
-                yield file
+            raise ValueError(f"{self.path}: expected a file, got a pipe; save it first.")
+        return open_regular(self.path, self._follow)
+
+    def _opened(self) -> contextlib.AbstractContextManager[BinaryIO]:
+        return self._file() if self._pipe is None else contextlib.nullcontext(self._pipe)
 
     @contextlib.contextmanager
     def _located(self, number: int, at: int, last: int | None = None) -> Iterator[None]:
@@ -353,11 +332,11 @@ class StreamReader(FrameSource):
 
 
 def _read(file: BinaryIO, count: int) -> bytes:
-    """Return `count` bytes, or fewer at the end. Read in chunks, because a damaged length must not
-    allocate memory.
+    """Return `count` bytes, or fewer at the end. Read part by part, because a damaged length must
+    not allocate memory.
     """
-    chunks = []
-    while count > 0 and (chunk := file.read(min(count, _CHUNK))):
-        chunks.append(chunk)
-        count -= len(chunk)
-    return b"".join(chunks)
+    parts = []
+    while count > 0 and (part := file.read(min(count, _READ_SIZE))):
+        parts.append(part)
+        count -= len(part)
+    return b"".join(parts)

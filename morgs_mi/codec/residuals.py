@@ -106,7 +106,7 @@ def take_change(
             changed = rows[flags >> GROUPS.index(name) & 1 == 1]
             for column in values.T[at]:
                 change = np.rint(reader.take(len(changed)) * step).astype(np.int64)
-                column[changed] = bounded(column[changed] + change, LIMIT, "value")
+                column[changed] = bounded(column[changed] + change, -LIMIT, LIMIT - 1)
     return values, dead
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import GroundTruth
-from morgs_mi.codec.container import PacketKind, encode_packet
+from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, exposed
@@ -51,7 +51,7 @@ class ComparedClip:
         packets = dict[int, tuple[PacketKind, int]]()
         for packet in stream:
             # Later packets of a frame are re-emitted keyframes.
-            packets.setdefault(packet.frame, (packet.kind, len(encode_packet(packet))))
+            packets.setdefault(packet.frame, (packet.kind, packet.num_bytes))
         recording = open_stream_capture(stream, capture, list(packets), any_recording)
         views = recording.test_views or recording.train_views
         channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))

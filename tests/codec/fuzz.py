@@ -46,7 +46,7 @@ THREAD_BYTES = 72 * 2**20
 THREADS = 4
 CASE_SECONDS = 30
 PLACE = re.compile(
-    r"packet \d+ at byte \d+: |expected a stream that starts with|expected format version|`.*` of "
+    r"packet \d+ at byte \d+: |expected a stream that starts with|`.*` of "
     r"the header|expected the path of its capture"
 )
 

@@ -17,7 +17,6 @@ from morgs_mi.codec.container import (
     StreamWriter,
     TruncatedStreamError,
     decode_packet,
-    encode_packet,
 )
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
@@ -87,8 +86,8 @@ def test_stream_reader__round_trips_header_and_packets(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("packet", PACKETS)
-def test_decode_packet__inverts_encode_packet(packet: Packet) -> None:
-    assert_equal(decode_packet(encode_packet(packet)), packet)
+def test_decode_packet__inverts_encoded(packet: Packet) -> None:
+    assert_equal(decode_packet(packet.encoded), packet)
 
 
 def test_packet__is_encoded_once_and_does_not_change() -> None:
@@ -96,7 +95,7 @@ def test_packet__is_encoded_once_and_does_not_change() -> None:
     packet = Packet(PacketKind.RESIDUAL, 1, {"a": array})
     encoded = packet.encoded
     assert packet.num_bytes == len(encoded)
-    assert encode_packet(packet) is encoded
+    assert packet.encoded is encoded
     array[:] = 7  # a copy is encoded
     assert packet.arrays["a"].tolist() == [0, 1, 2]
     with pytest.raises(ValueError, match="read-only"):
@@ -112,7 +111,7 @@ def test_decode_packet__restores_arrays_of_any_memory_order() -> None:
         "slice": array[::2, 1:],
         "swapped": array.astype(">f4"),
     }
-    got = decode_packet(encode_packet(Packet(PacketKind.RESIDUAL, 0, arrays))).arrays
+    got = decode_packet(Packet(PacketKind.RESIDUAL, 0, arrays).encoded).arrays
     for name, expected in arrays.items():
         np.testing.assert_array_equal(got[name], expected)
         assert not got[name].flags.writeable
@@ -164,20 +163,20 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "at least 20 bytes, got 0"),
-        (sealed(b"")[:-1], "at least 20 bytes, got 19"),
-        (sealed(b"\0" * 9)[:-1], "should have 9 bytes, got 8"),
+        (b"", "should have 20 bytes, got 0"),
+        (sealed(b"")[:-1], "should have 20 bytes, got 19"),
+        (sealed(b"\0" * 9)[:-1], "should have 29 bytes, got 28"),
         (sealed(b"", kind=7), r"1 \(keyframe\) or 2 \(residual\), got 7"),
         (sealed(b"", kind=0), r"1 \(keyframe\) or 2 \(residual\), got 0"),
         (sealed(b"\xff\xff\xff\xff"), "table of arrays is broken"),
         (with_table(b"no"), "table of arrays is broken"),
-        (with_table(b"[" * 60_000), "must be nested at most 32 levels deep"),
-        (with_table(b"[1]"), r"it must be a list of \[name, dtype, shape\]"),
-        (with_table(b'{"a": 1}'), r"it must be a list of \[name, dtype, shape\]"),
-        (with_table(b'[["a", "uint8"]]'), r"it must be a list of \[name, dtype, shape\]"),
+        (with_table(b"[" * 60_000), "table of arrays is broken .*recursion"),
+        (with_table(b"[1]"), "table of arrays is broken"),
+        (with_table(b'{"a": 1}'), "table of arrays is broken"),
+        (with_table(b'[["a", "uint8"]]'), "table of arrays is broken"),
         (with_table(b'[[["a"], "uint8", [1]]]', bytes(1)), r"is declared as uint8 \[1\]"),
-        (with_table(b'[["a", {"x": 1}, [1]]]', bytes(1)), r"`a` is declared as \{'x': 1\} \[1\]"),
-        (with_table(b'[["a", "f4,f4", [1]]]', bytes(8)), "`a` is declared as f4,f4"),
+        (with_table(b'[["a", {"x": 1}, [1]]]', bytes(1)), "table of arrays is broken"),
+        (with_table(b'[["a", "f4,f4", [1]]]', bytes(8)), "table of arrays is broken"),
         (with_table(b'[["a", "uint8", 1]]', bytes(1)), "`a` is declared as uint8 1"),
         (with_table(b'[["a", "uint8", [true]]]', bytes(1)), r"`a` is declared as uint8 \[True\]"),
         (with_table(b'[["a", "uint8", [1.0]]]', bytes(1)), r"`a` is declared as uint8 \[1.0\]"),
@@ -187,26 +186,26 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
         ),
         (
             with_table(b'[["a", "uint8", [1]], ["a", "uint8", [1]]]', bytes(2)),
-            "two arrays have one name",
+            r"`a` is declared as uint8 \[1\]",
         ),
-        (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, got NaN"),
+        (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, .* got NaN"),
         (
             with_table(b'[["a", "uint8", [' + b"1," * 33_000 + b"1]]]"),
             "must have at most 65536 bytes, got 66021",
         ),
-        (with_table(b'[["a", "object", [1]]]', bytes(8)), "`a` is declared as object"),
+        (with_table(b'[["a", "object", [1]]]', bytes(8)), "table of arrays is broken"),
         (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (
             with_table(b'[["a", "float32", [1000000000000]]]', bytes(8)),
-            "would end at byte 4000000000039 of 47",
+            "table of arrays is broken",
         ),
         (
             with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'),
-            "integers must have at most 64 bits",
+            "integers of at most 64 bits",
         ),
         (
             with_table(b'[["a", "uint8", [10000000000000000000000]]]'),
-            "integers must have at most 64 bits",
+            "integers of at most 64 bits",
         ),
         (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
     ],
@@ -220,13 +219,13 @@ def test_decode_packet__refuses_inconsistent_packets(data: bytes, message: str) 
 @pytest.mark.parametrize(
     ("packet", "message"),
     [
-        (Packet(PacketKind.HEADER, 0), "`kind` must be KEYFRAME or RESIDUAL"),
-        (Packet(PacketKind.RESIDUAL, -1), r"`frame` must be in 0..2\^32-1, got -1"),
+        (Packet(PacketKind.HEADER, 0), "expected a keyframe or residual .* got Packet.HEADER"),
+        (Packet(PacketKind.RESIDUAL, -1), r"of a frame in 0..2\^32-1 .* frame -1"),
         (
             Packet(PacketKind.RESIDUAL, 0, {"a": np.zeros(3)}),
-            "`a` must be one of float32, .* got float64",
+            "arrays of float32, .* got .* of float64",
         ),
-        (Packet(PacketKind.RESIDUAL, 0, {"a": np.array([None])}), "got object"),
+        (Packet(PacketKind.RESIDUAL, 0, {"a": np.array([None])}), "got .* of object"),
     ],
 )
 def test_stream_writer__refuses_invalid_packets_and_writes_nothing_of_them(
@@ -242,10 +241,15 @@ def test_stream_writer__refuses_invalid_packets_and_writes_nothing_of_them(
 def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> None:
     path = tmp_path / "s"
     path.write_bytes(b"ply\nformat ascii")
-    with pytest.raises(ValueError, match=r"expected a stream that starts with .* got b'ply"):
+    with pytest.raises(
+        ValueError, match=r"expected a stream that starts with b'MORGS-MI' and version 2, got b'ply"
+    ):
         StreamReader(path)
     path.write_bytes(struct.pack("<8sI", b"MORGS-MI", 9))
-    with pytest.raises(ValueError, match="expected format version 2, got 9"):
+    with pytest.raises(
+        ValueError,
+        match=r"and version 2, got b'MORGS-MI\\t.*; check the path, or read it with the release",
+    ):
         StreamReader(path)
     preamble = struct.pack("<8sI", b"MORGS-MI", 2)
     path.write_bytes(preamble + sealed(b"{}", kind=1))
@@ -256,12 +260,14 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
     path.write_bytes(preamble + sealed(b"{}", kind=0))
     with pytest.raises(
         ValueError,
-        match="packet 0 at byte 12: `cameras` is missing; 0 packets before it are intact",
+        match=r"packet 0 at byte 12: `cameras` must be a list .*; 0 packets before it are intact",
     ):
         StreamReader(path)
     with pytest.raises(FileNotFoundError):
         StreamReader(tmp_path / "none")
-    with pytest.raises(ValueError, match="`metadata` and `fps` must fit into JSON"):
+    with pytest.raises(
+        ValueError, match=r"a reader would refuse the header: .* not JSON serializable"
+    ):
         StreamWriter(tmp_path / "t", cameras(), 30, {"a": object()})
     assert not (tmp_path / "t").exists()
 

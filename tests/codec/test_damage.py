@@ -130,9 +130,7 @@ def test_stream_reader__skips_nothing_of_an_intact_stream(clip: Clip, tmp_path: 
 
 
 def test_stream_reader__skips_no_damage_in_a_pipe(clip: Clip) -> None:
-    with pytest.raises(
-        ValueError, match="expected a file to skip damage in, got a pipe; save it first"
-    ):
+    with pytest.raises(ValueError, match="expected a file, got a pipe; save it first"):
         StreamReader(io.BytesIO(clip.data), skip_damaged=True)
 
 

@@ -67,6 +67,6 @@ def test_old_streams__of_other_versions_are_named(tmp_path, version):
     (tmp_path / "other.morgs").write_bytes(data)
     with pytest.raises(
         ValueError,
-        match=f"expected format version {VERSION}, got {version}; read it with the release",
+        match=rf"and version {VERSION}, got b'MORGS-MI\\x0{version}.*read it with the release",
     ):
         StreamReader(tmp_path / "other.morgs")

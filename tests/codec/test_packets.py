@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import Packet, PacketKind, encode_packet
+from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.packets import (
     coded_frames,
     decode,
@@ -43,7 +43,7 @@ def test_decode__equals_a_decoder_from_the_specification(
 def test_residual_packet__of_a_static_frame_is_nearly_empty() -> None:
     state = decode(None, keyframe_packet(cloud(5000), 0, CAMERAS))
     packet = residual_packet(state, state.gaussians)
-    assert len(encode_packet(packet)) < 200
+    assert len(packet.encoded) < 200
     np.testing.assert_array_equal(decode(state, packet).grid.values, state.grid.values)
 
 
@@ -132,7 +132,7 @@ def test_decode__names_a_missing_packet() -> None:
         ValueError, match="packet of frame 3: it does not continue the state after frame 1"
     ):
         decode(states[1], packets[3])
-    with pytest.raises(ValueError, match="packet of frame 1: a residual needs the frame before it"):
+    with pytest.raises(ValueError, match="packet of frame 1: it does not continue a state"):
         decode(None, packets[1])
 
 
@@ -151,50 +151,53 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
             lambda key, _: with_head(key, 2**32 - 1, 1, 1, 60),
             r"take at least \d+ words of code, got",
         ),
-        (lambda key, _: with_head(key, 60, 4, 1, 60), "its degree must be at most 3, got 4"),
+        (
+            lambda key, _: with_head(key, 60, 4, 1, 60),
+            r"at most .*'degree': 3, .* got \[60, 4, 1, 60\]",
+        ),
         (
             lambda key, _: with_head(key, 60, 1, 5, 60),
-            "must have no bits beyond 0b1, got 0b101 with the unknown 0b100",
+            r"'optional': 1, .* got \[60, 1, 5, 60\]; read it with the release that wrote it",
         ),
         (lambda key, _: with_head(key, 60, 1, 1, 5), "its ids do not ascend"),
         (
             lambda key, _: with_head(key, 60, 1, 1, 2**30),
-            "its next id must be at most 1073741823, got 1073741824",
+            r"'next_id': 1073741823}, got \[60, 1, 1, 1073741824\]",
         ),
-        (lambda key, _: with_head(key, 60), "its head must have 4 numbers"),
+        (lambda key, _: with_head(key, 60), r"its head must have numbers .* got \[60\]"),
         (
             lambda _, residual: with_head(residual, 2**29, 8),
             r"take at least \d+ words of code, got",
         ),
         (
             lambda _, residual: with_head(residual, 2**31, 8),
-            "its next id must be at most 1073741823",
+            r"'births': \d+, .* got \[2147483648, 8\]",
         ),
         (
             lambda _, residual: with_head(residual, 0, 81),
-            "its quantizer step must be at most 80, got 81",
+            r"'quantizer_step': 80}, got \[0, 81\]",
         ),
         (lambda key, _: Packet(key.kind, 0, {"head": key.arrays["head"]}), "expected the arrays"),
         (lambda key, _: with_array(key, "offset", key.arrays["code"]), "expected the arrays"),
         (
             lambda key, _: with_array(key, "head", np.full(4, np.inf, np.float32)),
-            r"`head` must be uint32 \[n\], got f",
+            r"expected the arrays .* got {'head': 'float32 \[n\]'",
         ),
         (
             lambda key, _: with_array(key, "code", np.zeros(99, np.float32)),
-            r"`code` must be uint32 \[n\], got float32",
+            r"expected the arrays .* 'code': 'float32 \[n\]'",
         ),
         (
             lambda key, _: with_array(key, "code", key.arrays["code"][None]),
-            r"`code` must be uint32 \[n\], got uint32",
+            r"expected the arrays .* 'code': 'uint32 \[1, \d+\]'",
         ),
         (
             lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)),
-            r"`parent` must be uint8 \[n\]",
+            r"expected the arrays .* got {'parent': 'uint32 \[n\]'",
         ),
         (
             lambda _, residual: with_array(residual, "offset", np.zeros(8, np.uint8)),
-            r"`offset` must be uint32 \[n\]",
+            r"expected the arrays .* 'offset': 'uint8 \[n\]'",
         ),
         (
             lambda _, residual: with_array(residual, "offset", np.full(60, 2**32 - 1, "u4")),
@@ -230,15 +233,6 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
         (
             lambda s: keyframe_packet(replace(cloud(3), means=np.full((3, 3), np.nan)), 0),
             "`means` must be finite",
-        ),
-        (lambda s: residual_packet(s, cloud(4)), "`source` must be"),
-        (lambda s: residual_packet(s, cloud(3), np.array([0, -1, 1])), "`source` must be"),
-        (lambda s: residual_packet(s, cloud(3), np.array([1, 0, -1])), "`source` must be"),
-        (lambda s: residual_packet(s, cloud(3), np.array([0, 1, 9])), "`source` must be"),
-        (lambda s: residual_packet(s, cloud(3, degree=0)), "must have SH of degree 1"),
-        (
-            lambda s: residual_packet(s, cloud(3, confidence=False)),
-            r"\['logit_confidence'\] .* got .* \[\];",
         ),
         (lambda s: CodecConfig(quality=0), "`quality` must be above 0, got 0"),
         (lambda s: CodecConfig(target_size=-1), "`target_size` must be at least 0, got -1"),

@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import pytest
 
-from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, encode_packet
+from morgs_mi.codec.container import StreamWriter, TruncatedStreamError
 from morgs_mi.codec.packets import (
     CodedFrame,
     coded_frames,
@@ -87,7 +87,7 @@ def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> Non
     with sink:
         writer = StreamWriter(sink, CAMERAS, 25)
         writer.write(packets[0])
-        sink.write(encode_packet(packets[1])[:-1])
+        sink.write(packets[1].encoded[:-1])
     got = []
     with (
         source,
@@ -107,10 +107,8 @@ def test_stream_reader__refuses_to_seek_in_a_pipe() -> None:
         pass
     data.seek(0)
     reader = StreamReader(data)
-    with pytest.raises(ValueError, match="expected a file to seek in, got a pipe"):
+    with pytest.raises(ValueError, match="expected a file, got a pipe; save it first"):
         next(reader.near(1))
-    with pytest.raises(ValueError, match="expected a file that is read twice, got a pipe"):
-        reader.check()
 
 
 @pytest.mark.slow
