@@ -33,7 +33,7 @@ from morgs_mi.method.motion_model import (
     MotionModelFactory,
     sparse_product,
 )
-from morgs_mi.playback.export.order import equal_cells, z_order
+from morgs_mi.playback.export.clips import equal_cells, z_order
 
 
 @dataclass(frozen=True)

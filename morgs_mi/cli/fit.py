@@ -87,12 +87,13 @@ class Fit:
         reading = self.reading.read_config()
         capture = load_capture(self.capture, self.downscale, views, self.frames, reading)
         if self.chunks is not None or self.scheduler is not None:
-            from morgs_mi.runs.cluster.boundaries import ChunkConfig
+            from morgs_mi.core.threads import usable_cores
             from morgs_mi.runs.cluster.chunks import ChunkedRun, noting_chunks
-            from morgs_mi.runs.cluster.workers import cores, open_client
+            from morgs_mi.runs.cluster.tasks import ChunkConfig
+            from morgs_mi.runs.cluster.workers import open_client
 
             chunks = ChunkConfig(self.chunks or 1)
-            workers = min(chunks.count, cores())
+            workers = min(chunks.count, usable_cores())
             with (
                 noting_chunks(self.out),
                 progress() as report,

@@ -214,13 +214,10 @@ class StreamWriter:
         """Append one packet and return its number of bytes.
 
         Raises:
-            ValueError: the packet cannot be encoded, or the stream was closed.
+            ValueError: the packet cannot be encoded.
             OSError: it could not be written; a file is truncated to its last complete packet.
         """
-        if self._index is None:
-            raise ValueError(
-                f"{self.path}: expected a stream that is still open, got one that was closed."
-            )
+        assert self._index is not None
         at = self.num_bytes
         size = self._append(packet.encoded)
         self._index.append((packet.kind, packet.frame, at))
@@ -259,9 +256,8 @@ class StreamWriter:
                 raise
             raise OSError(
                 error.errno,
-                f"{self.path}: {len(data)} bytes could not be written ({error.strerror}), the "
-                f"file still has its {self.num_bytes} bytes of complete packets; free space on "
-                "the disk",
+                f"{self.path}: {len(data)} bytes could not be written ({error.strerror}) after "
+                f"{self.num_bytes} bytes of complete packets; free space on the disk",
             ) from error
         self.num_bytes += len(data)
         return len(data)
@@ -284,12 +280,9 @@ def open_packet(data: bytes) -> tuple[int, int, memoryview]:
         raise ValueError(f"a packet should have {PAYLOAD + length} bytes, got {len(data)}")
     payload = memoryview(data)[PAYLOAD:]
     kind, frame, _ = HEAD.unpack(head)
-    (stated_crc,) = _U32.unpack_from(data, HEAD.size)
-    crc = _crc(head, payload)
-    if crc != stated_crc:
-        raise ValueError(
-            f"its CRC should be {stated_crc:08x}, got {crc:08x}: the bytes are damaged"
-        )
+    (stated,) = _U32.unpack_from(data, HEAD.size)
+    if stated != (crc := _crc(head, payload)):
+        raise ValueError(f"its CRC should be {stated:08x}, got {crc:08x}: the bytes are damaged")
     return kind, frame, payload
 
 

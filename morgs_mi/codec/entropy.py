@@ -46,9 +46,8 @@ class ColumnWriter:
         for block in _blocks(len(tokens)):
             self._encoder.encode(tokens[block], _model(counts) if block.start else _FIRST)
             counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
-        for shift, some in _halves(bits):
+        for shift, some, num_values in _halves(bits):
             half = (rest[some] >> shift) & (2**_LOW - 1)
-            num_values = _value_counts(bits[some] - shift)
             self._encoder.encode(half.astype(np.int32), _MODEL.Uniform(), num_values)
 
     def words(self) -> np.ndarray:
@@ -84,8 +83,7 @@ class ColumnReader:
             if np.any(size >= _DIRECT):
                 bits = np.where(size < _DIRECT, 0, size - 12)
                 rest = np.zeros(count, np.int64)
-                for shift, some in _halves(bits):
-                    num_values = _value_counts(bits[some] - shift)
+                for shift, some, num_values in _halves(bits):
                     half = self._decoder.decode(_MODEL.Uniform(), num_values)
                     rest[some] |= half.astype(np.int64) << shift
                 size = np.where(bits > 0, (1 << bits) + rest, size)
@@ -122,11 +120,6 @@ def _signed(m: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.where(values > 0, 2 * m - 1, 2 * m).astype(np.int32)
 
 
-def _value_counts(bits: np.ndarray) -> np.ndarray:
-    """Return the number of values of the next half of some remaining bits, int32."""
-    return (1 << np.minimum(bits, _LOW)).astype(np.int32)
-
-
 def _blocks(count: int) -> Iterator[slice]:
     start = 0
     stop = _BLOCK
@@ -136,12 +129,14 @@ def _blocks(count: int) -> Iterator[slice]:
         stop = 2 * stop
 
 
-def _halves(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield (shift, indices) of the low and the high halves of the remaining bits."""
+def _halves(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield (shift, indices, numbers of values) of the low and the high halves of the remaining
+    bits.
+    """
     for shift in (0, _LOW):
         some = np.flatnonzero(bits > shift)
         if len(some):
-            yield shift, some
+            yield shift, some, (1 << np.minimum(bits[some] - shift, _LOW)).astype(np.int32)
 
 
 def _model(counts: np.ndarray) -> Any:

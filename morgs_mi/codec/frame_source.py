@@ -77,10 +77,7 @@ class FrameSource(Protocol):
         """
         state = next((state for state in self.states(frame) if state.frame >= frame), None)
         if state is None or state.frame != frame:
-            raise ValueError(
-                f"{self.path}: expected a frame of the stream, got {frame}; choose one that it "
-                "contains."
-            )
+            raise ValueError(f"{self.path}: expected a frame of the stream, got {frame}.")
         return state
 
 

@@ -30,14 +30,13 @@ from morgs_mi.codec.quantisation import (
     KNOWN_OPTIONAL,
     Grid,
     bounded,
-    finite_fields,
+    check_finite,
+    groups_of,
     new_grid,
     num_exponents,
     num_integers,
     optional_mask,
     real_values,
-    split_groups,
-    stored_fields,
 )
 from morgs_mi.codec.residuals import Coder, offset_steps, take_change
 from morgs_mi.core.camera import Camera
@@ -95,7 +94,9 @@ def keyframe_packet(
     Raises:
         ValueError: an attribute is not finite.
     """
-    grid = new_grid(split_groups(finite_fields(gaussians)), cameras, config or CodecConfig())
+    groups = groups_of(gaussians)
+    check_finite(groups)
+    grid = new_grid(groups, cameras, config or CodecConfig())
     return reemitted_keyframe(
         CodedFrame(frame, np.arange(len(grid), dtype=np.uint32), gaussians, grid, len(grid))
     )
@@ -113,7 +114,7 @@ def reemitted_keyframe(coded: CodedFrame) -> Packet:
     return Packet(
         PacketKind.KEYFRAME,
         coded.frame,
-        {"head": head, "code": _padded(writer.words(), len(grid), len(grid), grid)},
+        {"head": head, "code": _padded(writer.words(), len(grid), len(grid), grid.num_integers)},
     )
 
 
@@ -149,14 +150,14 @@ def residual_packet(
     attributes = (gaussians.sh_degree, optional_mask(gaussians.items()))
     assert attributes == (grid.degree, grid.optional)
     assert np.all(np.diff(survivors) > 0)
-    fields = finite_fields(gaussians)
-    groups = split_groups(fields)
+    groups = groups_of(gaussians)
+    check_finite(groups)
 
     # Survivors without any difference are skipped.
-    previous_fields = stored_fields(previous.gaussians)
+    previous_groups = groups_of(previous.gaussians)
     differs = np.zeros(len(survivors), bool)
-    for name, value in fields.items():
-        differences = value[: len(survivors)] != previous_fields[name][survivors]
+    for name, value in groups.items():
+        differences = value[: len(survivors)] != previous_groups[name][survivors]
         differs |= differences.any(axis=tuple(range(1, differences.ndim)))
     indices = np.flatnonzero(differs)
     rows = survivors[indices]
@@ -170,10 +171,8 @@ def residual_packet(
     coder = Coder(grid, survivors, rows, change, offset)
 
     births = len(gaussians) - len(survivors)
-    birth_grid = None
-    if births:
-        birth_groups = {name: value[-births:] for name, value in groups.items()}
-        birth_grid = new_grid(birth_groups, cameras, config)
+    birth_groups = {name: value[len(survivors) :] for name, value in groups.items()}
+    birth_grid = new_grid(birth_groups, cameras, config)
     quantizer_step, codes = _sized_codes(coder, birth_grid, config)
     arrays = {
         "parent": previous.digest,
@@ -184,7 +183,7 @@ def residual_packet(
 
 
 def _sized_codes(
-    coder: Coder, birth_grid: Grid | None, config: CodecConfig
+    coder: Coder, birth_grid: Grid, config: CodecConfig
 ) -> tuple[int, dict[str, np.ndarray]]:
     """Return the quantizer step of the changes, with which they fit into the `target_size` if there
     is one, and their words.
@@ -236,10 +235,7 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         if arrays != expected:
             raise ValueError(f"expected the arrays {expected}, got {arrays}")
         if previous is not None and packet.frame <= previous.frame:
-            raise ValueError(
-                f"its frame must be above {previous.frame}, the frame of the state, got "
-                f"{packet.frame}"
-            )
+            raise ValueError(f"its frame must be above {previous.frame}, got {packet.frame}")
         if not is_residual:
             first_id = 0 if previous is None else previous.first_id + max(previous.next_id, 1)
             return _decoded_keyframe(packet, first_id)
@@ -266,7 +262,7 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     limits = {"N": 2**32 - 1, "degree": 3, "optional": KNOWN_OPTIONAL, "next_id": LIMIT - 1}
     N, degree, optional, next_id = _head(packet, limits)
     code = packet.arrays["code"]
-    _check_words(code, N, N, degree, optional)
+    _check_words(code, N, N, num_integers(degree, optional))
     reader = ColumnReader(code)
     ids = np.cumsum(reader.take(N) + 1) - 1
     grid = _taken_grid(reader, N, degree, optional)
@@ -287,7 +283,7 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     values, dead = take_change(reader, grid, quantizer_step)
     survivors = np.flatnonzero(~dead)
     total = len(survivors) + births
-    _check_words(code, births, total, grid.degree, grid.optional)
+    _check_words(code, births, total, grid.num_integers)
     new = replace(grid, values=values).select(survivors)
     motion = np.zeros((total, 3), np.float32)
     previous_means = np.asarray(previous.gaussians.means)[survivors]
@@ -315,16 +311,22 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
 
 
 def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
-    E = num_exponents(optional)
+    first = 1 + num_exponents(optional)  # column of the values
     shifts = reader.take(num_integers(degree, optional))
-    largest = np.empty((N, 1), np.uint8)
-    exponents = np.empty((N, E), np.int8)
-    values = np.empty((N, len(shifts) - 1 - E), np.int32)
-    columns = chain(largest.T, exponents.T, values.T)
-    limits = [(0, 3), *[(-128, 127)] * E, *[(-LIMIT, LIMIT - 1)] * values.shape[1]]
-    for column, shift, (low, high) in zip(columns, shifts, limits, strict=True):
-        column[:] = bounded(reader.take(N) + shift, low, high)
+    largest = _taken_columns(reader, N, shifts[:1], 0, 3).astype(np.uint8)
+    exponents = _taken_columns(reader, N, shifts[1:first], -128, 127).astype(np.int8)
+    values = _taken_columns(reader, N, shifts[first:], -LIMIT, LIMIT - 1)
     return Grid(values, exponents, largest[:, 0], degree, optional)
+
+
+def _taken_columns(
+    reader: ColumnReader, N: int, shifts: np.ndarray, low: int, high: int
+) -> np.ndarray:
+    """Return columns of shifted integers in low..high, int32 [N, number of shifts]."""
+    columns = np.empty((N, len(shifts)), np.int32)
+    for column, shift in zip(columns.T, shifts, strict=True):
+        column[:] = bounded(reader.take(N) + shift, low, high)
+    return columns
 
 
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
@@ -341,17 +343,17 @@ def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
         writer.put(column)
 
 
-def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
+def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid) -> dict[str, np.ndarray]:
     """Return the words of the changes with a quantizer step, and of the births."""
     r = coder.rounded(quantizer_step)
     writer = ColumnWriter()
     for column in coder.columns(r):
         writer.put(column)
-    births = 0
-    if birth_grid is not None:
-        births = len(birth_grid)
+    births = len(birth_grid)
+    if births:
         _put_grid(writer, birth_grid)
-    codes = {"code": _padded(writer.words(), births, len(coder.survivors) + births, coder.grid)}
+    total = len(coder.survivors) + births
+    codes = {"code": _padded(writer.words(), births, total, birth_grid.num_integers)}
     if coder.offset is not None:
         offset_writer = ColumnWriter()
         for column in coder.offsets(r, quantizer_step):
@@ -371,24 +373,18 @@ def _head(packet: Packet, limits: dict[str, int]) -> list[int]:
     return head
 
 
-def _padded(words: np.ndarray, births: int, total: int, grid: Grid) -> np.ndarray:
-    return np.pad(
-        words, (0, max(0, _least_words(births, total, grid.degree, grid.optional) - len(words)))
-    )
+def _padded(words: np.ndarray, births: int, total: int, integers: int) -> np.ndarray:
+    return np.pad(words, (0, max(0, _least_words(births, total, integers) - len(words))))
 
 
-def _check_words(code: np.ndarray, births: int, total: int, degree: int, optional: int) -> None:
-    least = _least_words(births, total, degree, optional)
+def _check_words(code: np.ndarray, births: int, total: int, integers: int) -> None:
+    least = _least_words(births, total, integers)
     if len(code) < least:
-        raise ValueError(
-            f"{births} new of {total} Gaussians take at least {least} words of code, got "
-            f"{len(code)}"
-        )
+        raise ValueError(f"{births} births take at least {least} words of code, got {len(code)}")
 
 
-def _least_words(births: int, total: int, degree: int, optional: int) -> int:
+def _least_words(births: int, total: int, integers: int) -> int:
     """Return the number of words that a packet has at least if it adds some Gaussians to a state
-    with a new total.
+    with a new total, and each has so many integers.
     """
-    integers = num_integers(degree, optional)
     return -(-births * (integers if total * integers > _FREE_INTEGERS else 1) // _PER_WORD)

@@ -39,6 +39,7 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
 _STORED: dict[str, Attribute] = {row.name: row for row in ATTRIBUTES if row.error is not None}
+_ERRORS = {row.name: row.error for row in ATTRIBUTES if row.error is not None}  # tolerated
 # Every stream has these groups, and `_exponents` has a rule for each; all others are optional.
 _ALWAYS = ("means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest")
 _OPTIONAL = tuple(name for name in _STORED if name not in _ALWAYS)  # by bit of the mask
@@ -74,6 +75,11 @@ class Grid:
 
     def __len__(self) -> int:
         return len(self.values)
+
+    @property
+    def num_integers(self) -> int:
+        """Number of integers of a Gaussian."""
+        return num_integers(self.degree, self.optional)
 
     @cached_property
     def columns(self) -> dict[str, slice]:
@@ -136,19 +142,19 @@ class Grid:
 
     def _quats(self) -> np.ndarray:
         """Return the rotations as unit quaternions wxyz, float32 [N, 4]."""
-        u, v, w = np.ascontiguousarray(self.real("quats").T)
+        ratios = self.real("quats")
+        u, v, w = np.ascontiguousarray(ratios.T)
         length = np.sqrt(((1 + u * u) + v * v) + w * w)
         quats = np.empty((len(self), 4), np.float32)
-        rows = np.arange(len(self))
-        quats[rows, self.largest_components] = 1 / length
-        for k, ratio in enumerate((u, v, w)):
-            quats[rows, _component(k, self.largest_components)] = ratio / length
+        is_largest = _is_largest(self.largest_components)
+        quats[is_largest] = 1 / length
+        quats[~is_largest] = (ratios / length[:, None]).ravel()
         return quats
 
 
-def _component(k: int, largest_components: np.ndarray) -> np.ndarray:
-    """Return the place [N] of the k-th stored component among the four of each quaternion."""
-    return k + (k >= largest_components)
+def _is_largest(largest_components: np.ndarray) -> np.ndarray:
+    """Return the mask of the component of each quaternion that is not stored, bool [N, 4]."""
+    return np.arange(4) == largest_components[:, None]
 
 
 def optional_mask(names: Collection[str]) -> int:
@@ -176,14 +182,13 @@ def columns_of(degree: int, optional: int) -> dict[str, slice]:
 
 def num_exponents(optional: int) -> int:
     """Return the number E of exponents of a Gaussian."""
-    return max(at.stop for at in _exponent_columns(optional).values())
+    return len(_ALWAYS) + 2 + optional.bit_count()
 
 
 def num_integers(degree: int, optional: int) -> int:
     """Return the number of integers of a Gaussian: largest component, E exponents, C values."""
-    return (
-        1 + num_exponents(optional) + max(at.stop for at in columns_of(degree, optional).values())
-    )
+    *_, last = columns_of(degree, optional).values()
+    return 1 + num_exponents(optional) + last.stop
 
 
 def _exponent_columns(optional: int) -> dict[str, slice]:
@@ -218,39 +223,25 @@ def bounded(values: np.ndarray, low: int, high: int) -> np.ndarray:
     return values
 
 
-def stored_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the fields [N, ...] of Gaussians that a stream stores, by name."""
-    return {
-        name: value
-        for name, value in gaussians.numpy().items()
-        if name == "sh_coeffs" or name in GROUPS
-    }
-
-
-def split_groups(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return `stored_fields` by group: the spherical harmonics in two parts."""
-    sh = fields["sh_coeffs"]
-    return {name: value for name, value in fields.items() if name in GROUPS} | {
-        "sh_dc": sh[:, :1],
-        "sh_rest": sh[:, 1:],
-    }
-
-
-def finite_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the `stored_fields`.
-
-    Raises:
-        ValueError: one is not finite.
+def groups_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the raw attributes [N, ...] of Gaussians by group: the spherical harmonics in two
+    parts.
     """
-    fields = stored_fields(gaussians)
-    for name, value in fields.items():
+    fields = gaussians.numpy()
+    sh = fields["sh_coeffs"]
+    fields = {**fields, "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
+    return {name: fields[name] for name in GROUPS if name in fields}
+
+
+def check_finite(groups: Mapping[str, np.ndarray]) -> None:
+    """Raise a ValueError if a raw attribute is not finite."""
+    for name, value in groups.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
             raise ValueError(
                 f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the "
                 "learning rates."
             )
-    return fields
 
 
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
@@ -279,10 +270,12 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     for name in optional_names(grid.optional):
         if _STORED[name].activation is SIGMOID:  # which saturates
             numbers[name] = np.clip(raw[name], -_MAX_OPTIONAL, _MAX_OPTIONAL)
-    real = np.empty((max(at.stop for at in grid.columns.values()), N))
-    for name, at in grid.columns.items():
-        columns = numbers[name].reshape(N, at.stop - at.start).T
-        np.divide(columns, grid.steps(name).T, out=real[at])
+    real = np.concatenate(
+        [
+            numbers[name].reshape(N, at.stop - at.start).T / grid.steps(name).T
+            for name, at in grid.columns.items()
+        ]
+    )
     return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
 
 
@@ -291,9 +284,9 @@ def _quat_ratios(quats: np.ndarray, largest_components: np.ndarray) -> np.ndarra
     [N, 3].
     """
     quats = np.asarray(quats, np.float64)
-    rows = np.arange(len(largest_components))
-    others = np.stack([quats[rows, _component(k, largest_components)] for k in range(3)], axis=1)
-    largest = quats[rows, largest_components][:, None]
+    is_largest = _is_largest(largest_components)
+    others = quats[~is_largest].reshape(-1, 3)
+    largest = quats[is_largest][:, None]
     # The component that was the largest at birth is zero after a turn by 180 degrees; the ratio is
     # then very large.
     ratios = others / np.where(np.abs(largest) < 1e-12, 1e-12, largest)
@@ -307,7 +300,7 @@ def _exponents(
     tolerates.
     """
     precision = config.quality * config.birth_precision
-    error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
+    error, color = (2 * _ERRORS[name] / precision for name in ("means", "sh_dc"))
     pixel = _world_per_pixel(raw["means"], cameras)
     ones = np.ones(len(pixel))
     sizes = np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None]
@@ -343,14 +336,7 @@ def _generic_step(name: str, config: CodecConfig) -> float:
     Where the slope of the activation has no bound, the error applies to the optimised value.
     """
     precision = config.quality * config.birth_precision
-    return 2 * _tolerated(name) / precision / (_STORED[name].activation.largest_slope or 1.0)
-
-
-def _tolerated(name: str) -> float:
-    """Return the tolerated error of a stored attribute."""
-    error = _STORED[name].error
-    assert error is not None
-    return error
+    return 2 * _ERRORS[name] / precision / (_STORED[name].activation.largest_slope or 1.0)
 
 
 def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

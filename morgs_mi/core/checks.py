@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -48,7 +47,7 @@ def check_number(place: str, name: str, value: Any, interval: str) -> None:
     """
     low, high = map(float, interval[1:-1].split(","))
     lies_in = (
-        isinstance(value, Real)
+        isinstance(value, (int, float, np.number))
         and not isinstance(value, bool)
         and (low <= value if interval[0] == "[" else low < value)
         and (value <= high if interval[-1] == "]" else value < high)

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
@@ -52,13 +53,8 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     with Gaussians has the most detail; the others follow counterclockwise, seen from above.
 
     Raises:
-        ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
+        ValueError: there is no Gaussian in any of the frames.
     """
-    if axes not in _DIRECTIONS:
-        raise ValueError(
-            f"default_rig(): `axes` must be one of {', '.join(_DIRECTIONS)}, got {axes!r}; choose "
-            "one."
-        )
     low, high, size = _extent(frames)
     # A single Gaussian has no extent but its own, and one without extent is at least larger than
     # rounding errors.
@@ -104,12 +100,13 @@ def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]
     size of a Gaussian.
     """
     raw = [gaussians.numpy() for gaussians in frames]
-    means = _column(raw, "means")
+    means, logits = (
+        np.concatenate([values[name] for values in raw], dtype=np.float64)
+        for name in ("means", "logit_opacities")
+    )
     if not len(means):
-        raise ValueError(
-            "expected at least one Gaussian, got none; leave out files that are empty."
-        )
-    weights = 0.5 + 0.5 * np.tanh(0.5 * _column(raw, "logit_opacities")) + 1e-9
+        raise ValueError("expected at least one Gaussian, got none; leave out files without any.")
+    weights = expit(logits) + 1e-9
     percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
     corners = [
         np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T
@@ -117,7 +114,3 @@ def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]
     low, high = np.array(corners).T
     sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
     return low, high, float(np.exp(np.median(sizes)))
-
-
-def _column(raw: list[dict[str, np.ndarray]], name: str) -> np.ndarray:
-    return np.concatenate([values[name] for values in raw], dtype=np.float64)

@@ -18,9 +18,11 @@ from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Tensor
-from morgs_mi.playback.stream_header import metadata_entry, render_config
+from morgs_mi.playback.stream_header import metadata_entry, render_config, stream_exposure
 from morgs_mi.playback.visualise import (
     confidence_image,
     depth_image,
@@ -33,8 +35,6 @@ from morgs_mi.render.render_config import RenderConfig
 
 _ATTRIBUTE_CHANNELS = {row.channel: row.name for row in ATTRIBUTES if row.channel is not None}
 
-CHANNELS = ("color", "motion", *_ATTRIBUTE_CHANNELS, "offset", "depth", "alpha")
-"""All channels that can be shown: the renderer's, and the learned offset."""
 MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per
 frame.
@@ -54,7 +54,7 @@ def render_stream(
     Args:
         stream: the file.
         camera: any view, not necessarily one of the rig.
-        channels: out of `CHANNELS`; None for `available_channels`.
+        channels: such as `alpha` and `offset`; None for `available_channels`.
 
     Yields:
         (frame, images): per channel a float32 array [H, W, C], colour display-referred, motion and
@@ -92,7 +92,7 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     """Return the visualisation of a rendered channel, uint8 RGB [H, W, 3].
 
     Args:
-        name: one of `CHANNELS`.
+        name: of the channel.
         image: values of the channel [H, W, C].
         motion_scale: speed of full saturation in pixels, `OFFSET_SCALE` times that for an offset.
             The default is `MOTION_SCALE`, which is the same for all frames of a clip.
@@ -165,9 +165,21 @@ def render(
         image = rasterize(gaussians, camera, names, config=config)
         images = {name: image[name] for name in names}
     if "offset" in channels:
-        offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
-        offset_image = rasterize(
-            replace(gaussians, motion=offset), camera, ("motion",), config=config
-        )
-        images["offset"] = offset_image.motion
+        zero = np.zeros((len(gaussians), 3))
+        offset = zero if gaussians.offset is None else gaussians.offset
+        offset_gaussians = replace(gaussians, motion=offset)
+        images["offset"] = rasterize(offset_gaussians, camera, ("motion",), config=config).motion
     return {name: np.array(images[name]) for name in channels}
+
+
+def picture(
+    stream: FrameSource,
+    gaussians: Gaussians,
+    camera: Camera,
+    channel: str = "color",
+    motion_scale: float | None = None,
+) -> bytes:
+    """Return the `channel_image` of Gaussians of a stream as PNG, with the colours of a display."""
+    values = render(gaussians, camera, (channel,), render_config(stream))[channel]
+    values = exposed(values, stream_exposure(stream)) if channel == "color" else values
+    return png_bytes(channel_image(channel, values, motion_scale))

@@ -1,4 +1,4 @@
-"""What the header of a stream states: name, cameras, settings, and the fitted capture."""
+"""Content of a stream's header: name, cameras, settings, and the fitted capture."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import bounded, check_number
+from morgs_mi.core.checks import bounded, check_number, numbers
 from morgs_mi.core.config import apply_values
 from morgs_mi.core.fit_names import CAPTURE, STREAM
-from morgs_mi.playback.source import as_fitted
 from morgs_mi.render.render_config import RenderConfig
 
 _JSON_TYPES = {
@@ -128,13 +127,24 @@ def stream_origin(stream: FrameSource) -> np.ndarray:
     Raises:
         ValueError: the stream's header states something else.
     """
-    values = metadata_entry(stream, "origin", [0.0, 0.0, 0.0], list)
-    if len(values) != 3 or {*map(type, values)} - {int, float} or not bounded(values):
+    return _header_numbers(stream, "origin", stream.metadata.get("origin", [0.0, 0.0, 0.0]), (3,))
+
+
+def _header_numbers(
+    stream: FrameSource, key: str, values: Any, shape: tuple[int, ...]
+) -> np.ndarray:
+    """Return numbers of the header's metadata, float64 of a shape.
+
+    Raises:
+        ValueError: they are none, or have another shape.
+    """
+    array = numbers(f"{stream.path}: packet 0", key, values)
+    if array.shape != shape or not bounded(array):
         raise ValueError(
-            f"{_place(stream, 'origin')} must be three numbers, got {shortened(values)}; fit the "
-            "capture again."
+            f"{_place(stream, key)} must be numbers of the shape {list(shape)}, got "
+            f"{shortened(values)}; fit the capture again."
         )
-    return np.array(values, np.float64)
+    return array.astype(np.float64)
 
 
 def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) -> Any:
@@ -189,57 +199,42 @@ def open_stream_capture(
             capture is not the one that was fitted, or there are no frames.
     """
     path = capture or fitted_capture(stream)
-    recording = _recording(stream, path, frames)
-    if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
-        raise ValueError(
-            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of "
-            f"{path}, got {frames}; pass the capture that was fitted (--capture)."
-        )
-    stream_fingerprint = None  # imported streams have none
-    if not any_recording:
-        stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
-    if stream_fingerprint is not None:
-        refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-        images = next(recording.partial_frames(0, 1)).images
-        if fingerprint(recording, images, refines) != stream_fingerprint:
-            raise ValueError(
-                f"{recording.path}: expected the recording that {stream.path} was fitted to, got "
-                "other images in its first frame, or other points; pass that capture (--capture), "
-                "or compare with any recording (--any-recording)."
-            )
-    # Other refined cameras change no image, and ground truth refers to the recording's cameras.
-    if recording.display_exposure is not None:
-        recording = replace(recording, display_exposure=stream_exposure(stream))
-    return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
-
-
-def _recording(stream: FrameSource, path: str | Path, frames: Sequence[int]) -> Capture:
-    """Return the capture in a folder up to the last of the frames, read as for the fit of a stream;
-    its cameras are the cameras of the stream.
-    """
     values = metadata_entry(stream, "reading", {}, dict)
     # Older streams have settings that went.
     values = {key: values[key] for key in ReadConfig.__dataclass_fields__.keys() & values}
     reading = apply_values(ReadConfig(), values, _place(stream, "reading"))
     downscale = metadata_entry(stream, "downscale", 1, int, float)
     test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
-    if not frames:
-        raise ValueError(
-            f"{stream.path}: expected at least one frame, got a header alone; fit the capture "
-            "again."
-        )
-    view = "auto" if test_view == "auto" else None
-    recording = load_capture(path, downscale, view, frames[-1] + 1, reading)
+    mark = metadata_entry(stream, "fingerprint", None, str, NoneType)  # imported streams have none
+    refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
+    stop = max(frames, default=0) + 1
+    recording = load_capture(
+        path, downscale, "auto" if test_view == "auto" else None, stop, reading
+    )
     sizes, recorded_sizes = (
         {camera.name: (camera.width, camera.height) for camera in cameras}
         for cameras in (stream.cameras, recording.cameras)
     )
+    if recorded_sizes == sizes and test_view != "auto":
+        recording = recording.holding_out(test_view)
+    problem = None
     if recorded_sizes != sizes:
+        problem = f"the cameras {recorded_sizes}, not {sizes}"
+    elif not frames or frames != list(range(frames[0], min(stop, recording.num_frames))):
+        problem = f"{recording.num_frames} frames, not all of {shortened(frames)}"
+    elif mark is not None and not any_recording:
+        images = next(recording.partial_frames(0, 1)).images
+        if fingerprint(recording, images, refines) != mark:
+            problem = "other images in its first frame, or other points"
+    if problem is not None:
         raise ValueError(
-            f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got "
-            f"{recorded_sizes}; pass that capture (--capture)."
+            f"{path}: expected the recording that {stream.path} was fitted to, got {problem}; pass "
+            "that capture (--capture), or compare with any recording (--any-recording)."
         )
-    return recording if test_view == "auto" else recording.holding_out(test_view)
+    # Other refined cameras change no image, and ground truth refers to the recording's cameras.
+    if recording.display_exposure is not None:
+        recording = replace(recording, display_exposure=stream_exposure(stream))
+    return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 
 def fitted_capture(stream: FrameSource) -> str:
@@ -247,26 +242,37 @@ def fitted_capture(stream: FrameSource) -> str:
     header of older streams.
 
     Raises:
-        FileNotFoundError: it is not there any more.
-        ValueError: no path is stored.
+        FileNotFoundError: no path is stored, or the folder is not there any more.
     """
-    capture_file = None
+    documents: list[Any] = [stream.metadata]
     with suppress(OSError, ValueError):
-        capture_file = read_json(stream.path.with_name(CAPTURE))
-    entries = [
-        fields.get("capture")
-        for fields in (stream.metadata, capture_file)
-        if isinstance(fields, dict)
-    ]
+        documents.append(read_json(stream.path.with_name(CAPTURE)))
+    entries = [fields.get("capture") for fields in documents if isinstance(fields, dict)]
     paths = [path for path in entries if isinstance(path, str)]
-    remedy = "name its folder with --capture"
-    if not paths:
-        raise ValueError(
-            f"{stream.path}: expected the path of its capture in the capture.json beside it, "
-            f"found none; {remedy}."
-        )
     if folder := next((path for path in paths if Path(path).is_dir()), None):
         return folder
     raise FileNotFoundError(
-        f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
+        f"{stream.path}: expected the path of its capture in the capture.json beside it, found "
+        f"{paths[0] if paths else 'none'}; if it has moved, name its folder with --capture."
     )
+
+
+def as_fitted(capture: Capture, stream: FrameSource) -> Capture:
+    """Return a capture with the cameras of a stream, which its fit may have refined.
+
+    Raises:
+        ValueError: the distortions in the stream's header are no pairs of numbers.
+    """
+    distortions = metadata_entry(stream, "distortions", {}, dict)
+    values = [distortions.get(name, (0, 0)) for name in capture.names]
+    terms = _header_numbers(stream, "distortions", values, (len(capture.names), 2))
+    return capture.with_cameras(capture.with_delays(stream.cameras), terms.tolist())
+
+
+def about_lenses(capture: Capture) -> dict[str, Any]:
+    """Return the entries of a stream's header that `as_fitted` reads, none where no distortion was
+    refined.
+    """
+    pairs = zip(capture.names, capture.distortions, strict=bool(capture.distortions))
+    distortions = {name: list(terms) for name, terms in pairs if any(terms)}
+    return {"distortions": distortions} if distortions else {}

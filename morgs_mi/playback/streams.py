@@ -19,7 +19,7 @@ from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
-from morgs_mi.playback.export.notebook import stream_html
+from morgs_mi.playback.export.web import stream_html
 from morgs_mi.playback.trained_cameras import trained_cameras
 
 DRAWN = 0.5
@@ -97,8 +97,7 @@ def stream_path(out: str | Path) -> Path:
         if frames := [file.name for file in listed(path) if suffix_of(file)]:
             raise ValueError(
                 f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
-                f"one of them, such as {path / frames[0]}, or turn all into a stream with "
-                "`morgs-mi import`."
+                f"one, such as {path / frames[0]}, or run `morgs-mi import`."
             )
     path = path / STREAM if path.is_dir() else path
     if not path.is_file():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from reprlib import repr as shortened
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
     shares = visible @ weights
     good = shares >= _LEAST_RELATIVE * shares.max()
     if not good.all():
-        names = [cameras[i].name for i in np.flatnonzero(~good)]
+        names = [camera.name for camera, is_good in zip(cameras, good, strict=True) if not is_good]
         _log.warning(
             "%s: %d of %d cameras are left out, because they see next to nothing of the Gaussians "
             "of %s: %s.",
@@ -71,7 +72,7 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
             len(names),
             len(cameras),
             path.name,
-            ", ".join(names[:3]) + (" and others" if len(names) > 3 else ""),
+            shortened(names),
         )
     return file, tuple(cameras[i] for i in np.flatnonzero(good))
 

@@ -35,8 +35,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         ValueError: the image has another shape.
     """
     image = np.asarray(image)
-    if image.ndim == 2:
-        image = image[..., None]
+    image = image[..., None] if image.ndim == 2 else image
     if image.ndim != 3 or image.shape[2] not in (1, 3):
         raise ValueError(
             f"to_uint8(): `image` must be [H, W], [H, W, 1] or [H, W, 3], got {image.shape}."
@@ -66,10 +65,11 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
         ValueError: `motion` is not [H, W, 2], or the scale is not positive.
     """
     motion = np.asarray(motion, np.float32)
-    if motion.ndim != 3 or motion.shape[2] != 2:
-        raise ValueError(f"motion_image(): `motion` must be [H, W, 2], got {motion.shape}.")
-    if not scale_px > 0:
-        raise ValueError(f"motion_image(): `scale_px` must be positive, got {scale_px}.")
+    if motion.ndim != 3 or motion.shape[2] != 2 or not scale_px > 0:
+        raise ValueError(
+            "motion_image(): `motion` must be [H, W, 2] and `scale_px` positive, got "
+            f"{motion.shape} and {scale_px}."
+        )
     valid = np.asarray(np.isfinite(motion).all(-1))
     x, y = np.moveaxis(np.where(valid[..., None], motion, 0), -1, 0)
     hue = np.rad2deg(np.arctan2(y, x)) % 360
@@ -123,47 +123,27 @@ def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndar
 
     Static surfaces appear as horizontal streaks, noise as roughness. The columns of a short clip
     are repeated to a width of at least `least_width` pixels.
-
-    Raises:
-        ValueError: there is no column.
     """
-    if not columns:
-        raise ValueError("time_slice(): expected at least one column, got none.")
     return np.repeat(to_uint8(np.stack(columns, axis=1)), -(-least_width // len(columns)), axis=1)
 
 
-def depth_image(
-    depth: np.ndarray, near: float | None = None, far: float | None = None
-) -> np.ndarray:
-    """Return depth [H, W] or [H, W, 1] as colours, red near and blue far, linear in 1 / depth.
+def depth_image(depth: np.ndarray) -> np.ndarray:
+    """Return depth [H, W] or [H, W, 1] in world units as colours, linear in 1 / depth: red is the
+    1st percentile and nearer, blue the 99th and farther.
 
-    Args:
-        depth: world units; values that are not positive and finite are grey.
-        near: depth of the red end; default: from `depth_range`.
-        far: depth of the blue end; default: from `depth_range`.
+    Values that are not positive and finite are grey.
     """
     depth = np.asarray(depth, np.float64).reshape(np.shape(depth)[:2])
     valid = np.isfinite(depth) & (depth > 0)
     if not valid.any():
         return np.full((*depth.shape, 3), UNDEFINED, np.uint8)
-    low, high = depth_range(depth)
-    near = near or low
-    far = far or high
+    near, far = np.percentile(depth[valid], (1, 99))
     # 1 at the depth `near` and 0 at `far`.
     span = max(1 / near - 1 / far, 1e-12)
     nearness = (1 / np.where(valid, depth, far) - 1 / far) / span
     image = _apply_colour_map(nearness, cv2.COLORMAP_TURBO)
     image[~valid] = UNDEFINED
     return image
-
-
-def depth_range(depth: np.ndarray) -> tuple[float, float]:
-    """Return the 1st and the 99th percentile of the depths that are positive and finite; (1, 1) if
-    there is none.
-    """
-    values = depth[np.isfinite(depth) & (depth > 0)]
-    low, high = np.percentile(values, (1, 99)) if values.size else (1.0, 1.0)
-    return float(low), float(high)
 
 
 def label(image: np.ndarray, text: str) -> np.ndarray:
@@ -178,20 +158,12 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
 
 
 def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the images in one row on white, aligned at the top, 4 pixels apart.
-
-    Raises:
-        ValueError: there is no image.
-    """
+    """Return the images, at least one, in one row on white, aligned at the top, 4 pixels apart."""
     return _concatenate([to_uint8(image) for image in images], axis=1)
 
 
 def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-    """Return rows of images (see `side_by_side`) below each other, aligned at the left.
-
-    Raises:
-        ValueError: there is no row, or a row without an image.
-    """
+    """Return rows of images (see `side_by_side`) below each other, aligned at the left."""
     return _concatenate([side_by_side(row) for row in rows], axis=0)
 
 
@@ -201,14 +173,11 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
 
     Raises:
         OSError: the file cannot be written; the message names it and the cause.
-        ValueError: the image has no pixels, or a shape that `to_uint8` does not accept.
+        ValueError: the image has a shape that `to_uint8` does not accept.
     """
-    image = to_uint8(image)
-    if not image.size:
-        raise ValueError(f"write_png(): the image for {path} has no pixels: {image.shape}.")
     with atomic_path(path, "write_png()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(png_bytes(image))
+        partial.write_bytes(png_bytes(to_uint8(image)))
 
 
 def _apply_colour_map(values: np.ndarray, colour_map: int) -> np.ndarray:
@@ -217,8 +186,6 @@ def _apply_colour_map(values: np.ndarray, colour_map: int) -> np.ndarray:
 
 
 def _concatenate(images: list[np.ndarray], axis: int) -> np.ndarray:
-    if not images:
-        raise ValueError("side_by_side(), contact_sheet(): expected at least one image, got none.")
     largest = max(image.shape[1 - axis] for image in images)
     parts: list[np.ndarray] = []
     for image in images:

@@ -22,7 +22,7 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.playback.source import about_lenses, as_fitted
+from morgs_mi.playback.stream_header import about_lenses, as_fitted
 from morgs_mi.runs.fit_files import (
     FitFiles,
     Interrupted,

@@ -19,7 +19,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from reprlib import repr as shortened
@@ -49,7 +49,6 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 
 _LOG = logging.getLogger(__name__)
-_REMEDY = "start again without --resume"
 
 FILES = (STREAM, CAPTURE, REPORT)
 """Names of the files that a fit writes into its folder."""
@@ -241,8 +240,7 @@ class Recording:
         if not is_same_file(path, self._written):
             kind = "another file" if path.exists() else "none"
             raise FileNotFoundError(
-                f"{path}: expected the stream that is being written, found {kind}: it was "
-                "removed, moved or replaced; start again, or resume it where it is now."
+                f"{path}: expected the stream that is being written, found {kind}; resume it there."
             )
 
 
@@ -254,8 +252,7 @@ class Interrupted:
     index: Sequence[Entry]  #: The complete packets.
     end: int  #: Offset of the end of the last one.
     coded: CodedFrame  #: State after it.
-    previous_state: CodedFrame | None  #: State before the last frame; None if there is none.
-    last: Packet  #: First packet of the last frame.
+    restart: tuple[bytes, ...]  #: Encoded packets that lead a decoder to that state.
     reports: list[FrameReport]  #: Of the frames.
 
 
@@ -301,7 +298,7 @@ def interrupted_fit(
     assert coded is not None
     assert last is not None
     reports = read_reports(files.report, range(first, frame + 1))
-    return Interrupted(stream, index, end, coded, previous_state, last, reports)
+    return Interrupted(stream, index, end, coded, restart_of(previous_state, last), reports)
 
 
 def restart_of(previous_state: CodedFrame | None, last: Packet) -> tuple[bytes, ...]:
@@ -329,17 +326,16 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
     cameras = stream.cameras if refined else capture.cameras
     # Streams of earlier versions have paths in their headers.
     excluded_names = ("capture", "distortions")
-    old_metadata = _without_folders(
-        {name: value for name, value in stream.metadata.items() if name not in excluded_names}
-    )
+    old_metadata = {
+        name: value for name, value in stream.metadata.items() if name not in excluded_names
+    }
     old = json.loads(header_json(stream.cameras, stream.fps, old_metadata))
     new = json.loads(header_json(cameras, capture.fps, metadata))
     if difference := _difference(old, new):
         name, old_value, new_value = difference
         raise ValueError(
             f"{stream.path}: expected to resume a fit with {name} = {shortened(old_value)}, got "
-            f"{shortened(new_value)}; give the same capture and settings, or start again without "
-            "--resume."
+            f"{shortened(new_value)}; give the same, or start again without --resume."
         )
 
 
@@ -349,6 +345,11 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
     """
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
+    motion = replace(
+        config.motion,
+        flow_method=_without_folder(config.motion.flow_method),
+        mask_method=_without_folder(config.motion.mask_method),
+    )
     metadata = {
         "fingerprint": fingerprint(capture, first.images, config.fit.refine_cameras != "off"),
         "downscale": capture.downscale,
@@ -359,7 +360,8 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "key_views": [train[v] for v in key_views],
         # Without empty lists, such as terms that no module registers.
         "config": asdict(
-            config, dict_factory=lambda items: {k: value for k, value in items if value != ()}
+            replace(config, motion=motion),
+            dict_factory=lambda items: {k: value for k, value in items if value != ()},
         ),
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
@@ -368,29 +370,11 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         metadata["origin"] = list(capture.origin)
     if capture.display_exposure is not None:
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
-    return _without_folders(metadata)
-
-
-def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a header's metadata with methods such as ``onnx:FILE`` that have the names of their
-    files alone.
-    """
-    match metadata:
-        case {
-            "config": {
-                "motion": {"flow_method": str(flow), "mask_method": str(masks)} as motion
-            } as config
-        }:
-            motion = {
-                **motion,
-                "flow_method": _without_folder(flow),
-                "mask_method": _without_folder(masks),
-            }
-            return {**metadata, "config": {**config, "motion": motion}}
-    return dict(metadata)
+    return metadata
 
 
 def _without_folder(method: str) -> str:
+    """Return a method such as ``onnx:FILE`` with the name of its file alone."""
     kind, colon, files = method.partition(":")
     return kind + colon + ",".join(Path(file).name for file in files.split(","))
 
@@ -438,15 +422,13 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
                 ),
             }
             reports.append(FrameReport(**{**row, **values}))
+        if [report.frame for report in reports] != list(frames):
+            raise ValueError(f"{len(reports)} rows")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        description = f"a broken one ({error})" if path.exists() else "none"
         raise ValueError(
-            f"{path}: expected the report of the fit, got {description}; {_REMEDY}."
+            f"{path}: expected the report of {len(frames)} frames, got none or a broken one "
+            f"({error}); start again without --resume."
         ) from None
-    if [report.frame for report in reports] != list(frames):
-        raise ValueError(
-            f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {_REMEDY}."
-        )
     return reports
 
 

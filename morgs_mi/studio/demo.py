@@ -27,8 +27,7 @@ from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
 from morgs_mi.playback.player import channel_image, render_stream
-from morgs_mi.playback.source import about_lenses, as_fitted
-from morgs_mi.playback.stream_header import truth_for_camera
+from morgs_mi.playback.stream_header import about_lenses, as_fitted, truth_for_camera
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.runs.fit_capture import stream_capture

@@ -23,9 +23,8 @@ from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.runs.cluster.boundaries import ChunkConfig
 from morgs_mi.runs.cluster.chunks import ChunkedRun
-from morgs_mi.runs.cluster.tasks import Part
+from morgs_mi.runs.cluster.tasks import ChunkConfig, Part
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.quick import OPTIONS

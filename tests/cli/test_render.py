@@ -29,8 +29,8 @@ from tests.scenes.noise_capture import rig
         (
             ["a.gif", "--camera", "0"],
             (
-                "must be FILE.mp4, a folder ending in exr, FILE.exr for one frame, a folder "
-                "ending in png or FILE.png",
+                "must be FILE.mp4 or FILE.exr or FILE.png or a folder ending in exr or a folder "
+                "ending in png, got",
             ),
         ),
         (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),

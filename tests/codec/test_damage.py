@@ -160,9 +160,7 @@ def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> 
     packet = reemitted_keyframe(constant(free + 1, 3))
     assert len(packet.arrays["code"]) == -(-(free + 1) * 67 // 16)
     short = {**packet.arrays, "code": packet.arrays["code"][:-1]}
-    with pytest.raises(
-        ValueError, match=r"62602 new of 62602 Gaussians take at least \d+ words of code, got \d+"
-    ):
+    with pytest.raises(ValueError, match=r"62602 births take at least \d+ words of code, got \d+"):
         decode(None, Packet(packet.kind, 0, short))
     assert len(decode(None, packet)) == free + 1
 

@@ -205,7 +205,7 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
         ),
         (
             lambda _, residual: replace(residual, frame=0),
-            "its frame must be above 0, the frame of the state, got 0",
+            "its frame must be above 0, got 0",
         ),
     ],
 )

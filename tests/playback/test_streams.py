@@ -196,7 +196,7 @@ def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, command):
             "a.png: expected one image for one file, got 150; name a folder",
         ),
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
-        (("--degrees", "0"), "--degrees must be 1 to 360, got 0"),
+        (("--degrees", "0"), "--degrees must be a number in [1, 360], got 0"),
         (("--width", "0"), "--width must be a number in [1, inf), got 0"),
         (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
     ],

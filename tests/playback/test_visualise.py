@@ -46,13 +46,6 @@ def test_grey_image__is_the_mean_of_the_components():
     assert (visualise.grey_image(np.tile([0, 0, 0.4, 0.4], (2, 3, 1))) == 51).all()
 
 
-def test_depth_range__are_the_percentiles_of_known_depths():
-    assert_close(
-        visualise.depth_range(np.r_[np.arange(101.0), np.nan, -5, 0]), (1.99, 99.01), atol=1e-6
-    )
-    assert visualise.depth_range(np.zeros(3)) == (1, 1)
-
-
 def test_confidence_legend__agrees_with_the_image():
     legend = visualise.confidence_legend(size=90)
     for row, value in ((0, 1.0), (89, 0.0)):
@@ -72,7 +65,7 @@ def test_time_slice__time_increases_to_the_right():
 
 def test_depth_image__near_is_red_far_is_blue_undefined_is_grey():
     depth = np.array([[1.0, 2.0, 10.0, 0.0, np.inf, np.nan]])
-    red, _, blue, *undefined = visualise.depth_image(depth, near=1.0, far=10.0)[0].astype(int)
+    red, _, blue, *undefined = visualise.depth_image(depth)[0].astype(int)
     assert red[0] > red[2]
     assert blue[2] > blue[0]
     assert (np.array(undefined) == 128).all()
@@ -122,11 +115,8 @@ def test_write_png__removes_its_output_after_a_failure(tmp_path):
         (lambda: visualise.motion_image(np.zeros((2, 2)), 1), r"motion_image\(\).*\[H, W, 2\]"),
         (
             lambda: visualise.motion_image(np.zeros((2, 2, 2)), 0),
-            r"motion_image\(\).*positive, got 0",
+            r"motion_image\(\).*positive, got .* and 0",
         ),
-        (lambda: visualise.side_by_side([]), "at least one"),
-        (lambda: visualise.time_slice([]), "at least one column"),
-        (lambda: visualise.write_png("x.png", np.zeros((0, 2))), "no pixels"),
     ],
 )
 def test_visualise__rejects_invalid_input(call, message):

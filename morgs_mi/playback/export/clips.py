@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource, FrameState, play
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import moved
@@ -18,7 +19,6 @@ from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.formats import Format
-from morgs_mi.playback.export.order import by_place
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from morgs_mi.playback.player import available_channels, render
 from morgs_mi.playback.stream_header import render_config, stream_origin
@@ -27,6 +27,8 @@ Progress = Callable[[int, int], None] | None
 # Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be
 # tilted.
 _SWING = 60.0
+
+_CELL_BITS = 10  # of a Z-order curve per axis
 
 
 def frame_numbers(stream: FrameSource) -> list[int]:
@@ -37,10 +39,7 @@ def frame_numbers(stream: FrameSource) -> list[int]:
     """
     numbers = stream.frame_numbers()
     if not numbers:
-        raise ValueError(
-            f"{stream.path}: at least one frame was expected, got none; the stream has only a "
-            "header."
-        )
+        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone.")
     return numbers
 
 
@@ -54,26 +53,68 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     numbers = frame_numbers(stream)
     if span is None:
         return numbers
+    parts = span.split(":")
+    defaults = (numbers[0], numbers[-1] + 1, 1)
     try:
-        parts = [int(part) if part.strip() else None for part in span.split(":")]
-        start, stop, step = (*parts, None, None)[:3]
-        if len(parts) > 3 or (step is not None and step < 1):
-            raise ValueError
+        pairs = zip(parts, defaults, strict=len(parts) > len(defaults))
+        values = [int(part) if part.strip() else default for part, default in pairs]
+        start, stop, step = (*values, values[0] + 1 if len(parts) == 1 else 1, 1)[:3]
+        indices = range(start, stop, step)
     except ValueError:
-        raise ValueError(
-            f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}."
-        ) from None
-    if len(parts) == 1:
-        stop = None if start is None else start + 1
-    low = numbers[0] if start is None else start
-    high = numbers[-1] + 1 if stop is None else stop
-    indices = range(low, high, step or 1)
+        indices = range(0)
     if frames := [number for number in numbers if number in indices]:
         return frames
     raise ValueError(
-        f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
-        f"{numbers[-1]}, got {span!r}."
+        "select_frames(): `span` must be like 12, 10:20 or 0:100:5 and select frames of "
+        f"{stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
     )
+
+
+def by_place(stream: FrameSource) -> Iterator[tuple[int, Gaussians]]:
+    """Yield (frame, Gaussians) like `play`, with the Gaussians along a Z-order curve of the places
+    of their births.
+
+    Neighbours on the curve are neighbours in space and mostly move together. As the place of the
+    birth does not change, Gaussians that live in two frames have the same order in both.
+
+    Raises:
+        ValueError: a broken packet.
+    """
+    all_ids = np.zeros(0, np.int64)
+    all_keys = np.zeros(0, np.int64)
+    cells = None
+    for state in stream.states():
+        ids = state.lasting_ids
+        means = state.gaussians.numpy()["means"]
+        if len(ids) and (cells is None or not np.isin(ids, all_ids).any()):
+            cells = equal_cells(means)
+        births = ~np.isin(ids, all_ids)
+        if cells is not None and births.any():
+            all_ids = np.concatenate([all_ids, ids[births]])
+            all_keys = np.concatenate([all_keys, z_order(means[births], cells)])
+        keys = all_keys[np.searchsorted(all_ids, ids)]
+        yield state.frame, state.gaussians.select(np.argsort(keys, kind="stable"))
+
+
+def equal_cells(points: np.ndarray) -> np.ndarray:
+    """Return the inner bounds [1023, 3] of cells with equal numbers of points [N, 3] along each
+    axis.
+
+    Unlike cells of equal size, they are not widened by far points.
+    """
+    return np.quantile(points, np.linspace(0, 1, 2**_CELL_BITS + 1)[1:-1], axis=0)
+
+
+def z_order(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Return the places int64 [N] of points [N, 3] on a Z-order curve through a grid with the inner
+    bounds `cells`.
+    """
+    keys = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        index = np.searchsorted(cells[:, axis], points[:, axis])
+        for bit in range(_CELL_BITS):
+            keys |= (index >> bit & 1) << (3 * bit + axis)
+    return keys
 
 
 def write_ply_files(
@@ -141,7 +182,7 @@ def flight(
     Args:
         stream: the file.
         path: the moving camera; it determines the number of images, see `num_images`.
-        channels: out of `CHANNELS`; None for `available_channels`.
+        channels: as for `render_stream`; None for `available_channels`.
         clip: Gaussians of each image; None: `repeated_frames`.
 
     Yields:
@@ -200,10 +241,7 @@ def repeated_seconds(clip: float, least: float) -> float:
     Raises:
         ValueError: `least` is negative or not finite.
     """
-    if not 0 <= least < math.inf:
-        raise ValueError(
-            f"repeated_seconds(): `least` must be finite and not negative, got {least}."
-        )
+    check_number("repeated_seconds()", "least", least, "[0, inf)")
     return clip * max(1, math.ceil(least / clip - 1e-9))
 
 

@@ -63,16 +63,12 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
     if matches := [choice for choice in formats if choice.matches(output)]:
         return max(matches, key=lambda choice: len(choice.name))
     suffix = re.search(r"\.[a-z]\w*$", name := Path(output).name.lower())
-    if suffix is None and (folders := [choice for choice in formats if choice.folder]):
+    folders = [choice for choice in formats if choice.folder]
+    if suffix is None and folders:
         return folders[0]
-    words: list[str] = []
-    for choice in formats:
-        if choice.folder:
-            words.append(f"a folder ending in {choice.ending}" if choice.ending else "a folder")
-        if choice.name:
-            words.append(f"FILE.{choice.name}" + (" for one frame" if choice.folder else ""))
-    outputs = list(dict.fromkeys(words))
-    expected = " or ".join(filter(None, (", ".join(outputs[:-1]), outputs[-1])))
+    names = [f"FILE.{choice.name}" for choice in formats if choice.name]
+    endings = [choice.ending and f" ending in {choice.ending}" for choice in folders]
+    expected = " or ".join([*names, *(f"a folder{ending}" for ending in endings)])
     raise ValueError(
         f"{output}: the output must be {expected}, got {suffix[0] if suffix else name!r}."
     )
@@ -101,8 +97,5 @@ def destination(
     if choice.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
     if path.exists() and stream.exists() and path.samefile(stream):
-        raise ValueError(
-            f"{path}: expected an output beside its source, got the source itself; choose "
-            "another name."
-        )
+        raise ValueError(f"{path}: expected an output beside its source; choose another name.")
     return path, choice

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, intrinsics_of_fov, rigid
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.rig import up_direction
 
 if TYPE_CHECKING:
@@ -26,13 +28,6 @@ if TYPE_CHECKING:
 # Weight of the Gaussians' median relative to an optical axis; it matters only where the axes do not
 # meet.
 _MEDIAN_WEIGHT = 0.01
-# Keys of other files of cameras, and what these are.
-_OTHER_FILES = {
-    "camera_path": "a camera path of Nerfstudio",
-    "path": "a camera path of instant-ngp",
-    "frames": "the calibration of a capture",
-    "w2c": "the calibration of a capture",
-}
 
 
 @dataclass(frozen=True)
@@ -40,8 +35,7 @@ class CameraPath:
     """A camera that moves through key views.
 
     Raises:
-        ValueError: fewer than two keys, times that do not increase from 0, or different image
-            sizes.
+        ValueError: fewer than two keys, times that do not increase from 0, or different sizes.
     """
 
     times: np.ndarray  #: Seconds [K], increasing from 0.
@@ -50,18 +44,15 @@ class CameraPath:
     def __post_init__(self) -> None:
         times = np.asarray(self.times, np.float64)
         object.__setattr__(self, "times", times)
-        if len(self.keys) < 2 or times.shape != (len(self.keys),):
-            raise ValueError(
-                "CameraPath(): at least two key views with a time each were expected, got "
-                f"{len(self.keys)} views and {times.size} times."
-            )
-        if times[0] != 0 or not np.all(np.diff(times) > 0):
-            raise ValueError(f"CameraPath(): `times` must increase from 0, got {times.tolist()}.")
         sizes = {(key.width, key.height) for key in self.keys}
-        if len(sizes) > 1:
+        are_times = (
+            times.shape == (len(self.keys),) and times[0] == 0 and np.all(np.diff(times) > 0)
+        )
+        if len(self.keys) < 2 or len(sizes) > 1 or not are_times:
             raise ValueError(
-                f"CameraPath(): `keys` must have the same image size, got {sorted(sizes)}; resize "
-                "them."
+                "CameraPath(): expected at least two key views of one size, with `times` that "
+                f"increase from 0, got {len(self.keys)} views of {sorted(sizes)} at "
+                f"{times.tolist()}."
             )
 
     @property
@@ -95,10 +86,7 @@ class CameraPath:
         Raises:
             ValueError: `seconds` is not positive and finite.
         """
-        if not (np.isfinite(seconds) and seconds > 0):
-            raise ValueError(
-                f"CameraPath.with_duration(): `seconds` must be positive, got {seconds}."
-            )
+        check_number("CameraPath.with_duration()", "seconds", seconds, "(0, inf)")
         return replace(self, times=self.times * (seconds / self.seconds))
 
     @cached_property
@@ -152,12 +140,10 @@ def orbit(
     arm = first.position - center
     if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
         raise ValueError(
-            f"orbit(): the camera {first.name!r} must stand beside the scene, got it directly "
-            "above; use another path."
+            f"orbit(): the camera {first.name!r} must stand beside the scene; use another path."
         )
     degrees = _rig_width(cameras, center, up) if degrees is None else degrees
-    if not 1 <= degrees <= 360:
-        raise ValueError(f"orbit(): `degrees` must be 1 to 360, got {degrees:g}.")
+    check_number("orbit()", "degrees", degrees, "[1, 360]")
     start = 0 if degrees == 360 else -degrees / 2
     # The key views are about 10 degrees apart.
     angles = np.linspace(start, start + degrees, max(5, round(degrees / 10) + 1))
@@ -177,10 +163,7 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
         ValueError: there are fewer than two cameras.
     """
     if len(cameras) < 2:
-        raise ValueError(
-            "through_cameras(): at least two cameras were expected to move between, got "
-            f"{len(cameras)}; use the path `orbit`."
-        )
+        raise ValueError("through_cameras(): expected two cameras or more; use the path `orbit`.")
     first, *candidates = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
     keys = [first]
     while candidates:
@@ -209,36 +192,23 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
     if not Path(file).is_file():
         raise FileNotFoundError(f"{file}: expected a camera path, found none; check the path.")
     document = read_json(file)
-    keys = document.get("keys") if isinstance(document, dict) else None
-    if not isinstance(keys, list) or not all(isinstance(key, dict) for key in keys):
-        raise ValueError(
-            f"{file}: expected a JSON object with a list `keys` of objects, got "
-            f"{_described(document)}; write the views of the camera path as `keys`."
-        )
-    views = []
-    times = []
-    for i, entry in enumerate(keys):
-        key = {**document, **entry}
-        try:
+    place = str(file)
+    try:
+        views = []
+        times = []
+        for i, entry in enumerate(document["keys"]):
+            place = f"{file}: key {i}"
+            key = {**document, **entry}
             times.append(float(key["time"]))
             views.append(_key_view(key, cameras))
-        except KeyError as error:
-            raise ValueError(f"{file}: key {i}: {error.args[0]!r} is missing.") from None
-        except (ValueError, TypeError, OverflowError) as error:
-            raise ValueError(f"{file}: key {i}: {error}") from None
-    try:
+        place = str(file)
         return CameraPath(np.asarray(times), tuple(views))
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-
-
-def _described(document: Any) -> str:
-    """Return what a JSON document that is no camera path contains."""
-    if not isinstance(document, dict):
-        return "a list" if isinstance(document, list) else repr(document)[:80]
-    programs = [f", {program}" for key, program in _OTHER_FILES.items() if key in document]
-    names = ", ".join(f"`{name}`"[:40] for name in list(document)[:6]) or "nothing"
-    return f"an object with {names}" + "".join(programs[:1])
+    except (KeyError, ValueError, TypeError, OverflowError) as error:
+        raise ValueError(
+            f"{place}: expected a JSON object with a list `keys` of views, got "
+            f"{shortened(document)} ({type(error).__name__}: {error}); write the views of the "
+            "camera path as `keys`."
+        ) from None
 
 
 def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
@@ -249,7 +219,7 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
         name = key["camera"]
         by_name = {camera.name: camera for camera in cameras}
         if name not in by_name:
-            raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {name!r}.")
+            raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {name!r}")
         return by_name[name].resized(like.width, like.height)
     if "fov_x" in key:
         like = replace(like, K=intrinsics_of_fov(float(key["fov_x"]), like.width, like.height))
@@ -257,12 +227,8 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
         return replace(like, viewmat=rigid("`viewmat`", np.asarray(key["viewmat"], np.float64)))
     position, target = (np.asarray(key[name], np.float64) for name in ("position", "target"))
     up = np.asarray(key["up"], np.float64) if "up" in key else up_direction(cameras)
-    are_vectors = all(vector.shape == (3,) for vector in (position, target, up))
-    if not are_vectors or not np.cross(target - position, up).any():
-        raise ValueError(
-            "`position`, `target` and `up` must have 3 numbers each, and the view must not be "
-            "along `up`."
-        )
+    if not np.cross(target - position, up).any():
+        raise ValueError("the view must not be along `up`")
     return _look_at(position, target, up, like)
 
 

@@ -1,5 +1,5 @@
-"""A stream as a web page that plays it: one file, or a folder for a web server with a module for
-other pages.
+"""A stream as a web page that plays it: one file, a folder for a web server with a module for other
+pages, or the output of a notebook's cell.
 
 The page and the module are built from `web/` and part of the package. The page contains its script,
 compressed, and in a single file the stream as well. Both are stored as text with 7 bits per
@@ -8,6 +8,7 @@ character (`text_of_bytes`).
 
 from __future__ import annotations
 
+import base64
 import gzip
 import html
 import io
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.frame_source import FrameSource
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER
@@ -31,7 +32,7 @@ from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import seen_points
 from morgs_mi.playback.default_rig import DEFAULT_RIG
-from morgs_mi.playback.player import MOTION_SCALE
+from morgs_mi.playback.player import MOTION_SCALE, picture
 from morgs_mi.playback.stream_header import (
     metadata_entry,
     stream_exposure,
@@ -49,6 +50,17 @@ _SAMPLES = 500
 # Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show
 # the fit's noise.
 _LEAST_SCALE = 0.001
+# Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
+LARGEST = 4_000_000
+# Width and height of the player in pixels, unless the output of the cell is narrower.
+_WIDTH = 800
+_HEIGHT = 600
+_STYLE = "width:100%;max-width:{width:.0f}px;aspect-ratio:{aspect:.4f};border:0;border-radius:8px"
+_PLAYER = (
+    '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" '
+    'srcdoc="{page}"></iframe>'
+)
+_POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
 
 
 def write_web_page(
@@ -118,6 +130,31 @@ def write_web_folder(
     return sum(map(len, contents.values()))
 
 
+def stream_html(stream: FrameSource) -> str:
+    """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it
+    would be too large.
+
+    A stream that cannot be read becomes the sentence that describes why.
+    """
+    try:
+        camera = stream.cameras[0]
+        size = stream.path.stat().st_size
+        aspect = camera.width / camera.height
+        style = _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
+        title = html.escape(stream_name(stream))
+        if size <= LARGEST:
+            page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
+            return _PLAYER.format(title=title, style=style, page=page)
+        gaussians = next(gaussians for _, gaussians in play(stream))
+        image = base64.b64encode(picture(stream, gaussians, camera)).decode()
+    except (OSError, ValueError, StopIteration) as error:
+        message = str(error) or f"{stream.path}: expected at least one frame, got none."
+        return f"<div>{html.escape(message)}</div>"
+    command = html.escape(f"morgs-mi export web {stream.path} page.html")
+    text = f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with <code>{command}</code>."
+    return _POSTER.format(title=title, style=style, image=image, text=text)
+
+
 def served_page(title: str, has_recording: bool) -> bytes:
     """Return the page for the server of `playback.viewer`, which has the stream as a file.
 
@@ -148,9 +185,6 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
     """Return the stream with the metadata that the page reads, after decoding it once; errors as
     `write_web_page`.
     """
-    metadata: dict[str, Any] = {
-        "config": {"render": metadata_entry(stream, "config.render", {}, dict)}
-    }
     packets = list(stream)
     speeds = []
     for coded in coded_frames(packets):
@@ -160,16 +194,17 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
     if not speeds:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
     speeds, weights = np.hstack(speeds)
-    metadata["motion_scale"] = MOTION_SCALE
+    scale = MOTION_SCALE
     if weights.any():
         # Not the maximum: a few Gaussians that the fit has lost are several times as fast as the
         # scene.
         scale = np.percentile(speeds, 99, weights=weights, method="inverted_cdf")
-        metadata["motion_scale"] = max(_LEAST_SCALE, float(scale))
-    if stream.metadata.get(DEFAULT_RIG) is True:
-        metadata[DEFAULT_RIG] = True
-    if (origin := stream_origin(stream)).any():
-        metadata["origin"] = origin.tolist()
+    metadata: dict[str, Any] = {
+        "config": {"render": metadata_entry(stream, "config.render", {}, dict)},
+        "motion_scale": max(_LEAST_SCALE, float(scale)),
+        "origin": stream_origin(stream).tolist(),
+        DEFAULT_RIG: stream.metadata.get(DEFAULT_RIG) is True,
+    }
     if stops := stream_exposure(stream):
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
     sink = io.BytesIO()
@@ -186,31 +221,22 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     A speed is a fraction of the image's width per frame. A weight is the opacity times the area on
     the screen.
     """
-    if gaussians.motion is None:
-        return np.zeros((2, 0))
     motion = np.asarray(gaussians.motion)
     rows = np.flatnonzero(motion.any(axis=1))
     rows = rows[:: len(rows) // _SAMPLES + 1]
-    motion = motion[rows]
     raw = gaussians.numpy()
     means = raw["means"][rows]
     # A stream may contain any scale; the bound keeps the weights finite.
     log_sizes = np.minimum(raw["log_scales"][rows].mean(axis=1), 20)
     weights = np.asarray(gaussians.opacities)[rows] * np.exp(2 * log_sizes)
-    return np.hstack([_view_speeds(camera, means, motion, weights) for camera in cameras])
-
-
-def _view_speeds(
-    camera: Camera, means: np.ndarray, motion: np.ndarray, weights: np.ndarray
-) -> np.ndarray:
-    """Return the speeds of the Gaussians that a camera sees, and their weights on the screen
-    [2, S].
-    """
-    visible, _, depths = seen_points(camera, means)
-    jacobians = camera.projection_jacobian(means[visible])
-    motions = np.einsum("nij,nj->ni", jacobians, motion[visible])
-    speeds = np.linalg.norm(motions, axis=1) / camera.width
-    return np.stack([speeds, weights[visible] / depths**2])
+    views = []
+    for camera in cameras:
+        visible, _, depths = seen_points(camera, means)
+        jacobians = camera.projection_jacobian(means[visible])
+        motions = np.einsum("nij,nj->ni", jacobians, motion[rows][visible])
+        speeds = np.linalg.norm(motions, axis=1) / camera.width
+        views.append(np.stack([speeds, weights[visible] / depths**2]))
+    return np.hstack(views)
 
 
 def _player() -> Traversable:

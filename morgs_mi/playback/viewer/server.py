@@ -11,35 +11,41 @@ images of this machine.
 from __future__ import annotations
 
 import logging
+import os
+import re
 import secrets
 import socket
+from collections.abc import Iterator
 from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, BinaryIO
+from urllib.parse import quote
 
 import cv2
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import camera_of_fields, load_json
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.bounded import open_regular
 from morgs_mi.core.fit_names import PROVISIONAL, STREAM
 from morgs_mi.playback.export.web import published_bytes, served_page
 from morgs_mi.playback.stream_header import stream_name
 from morgs_mi.playback.streams import SplatFile
-from morgs_mi.playback.viewer.access import Access
-from morgs_mi.playback.viewer.connections import MOST, Connection, log_limit_once
-from morgs_mi.playback.viewer.exact import ExactImages
-from morgs_mi.playback.viewer.recorded import RecordedImages
-from morgs_mi.playback.viewer.stream_bytes import stream_response
+from morgs_mi.playback.viewer.access import MOST, Access, Connection, log_limit_once
+from morgs_mi.playback.viewer.images import ExactImages, RecordedImages
 
 _GRACE = 1  # seconds for answers that are under way at the end
 _MOST_CAMERA_BYTES = 4096
+_READ_SIZE = 2**20
+# One range of bytes; others are ignored, as HTTP allows. 15 digits: more than any file has bytes.
+_RANGE = re.compile(r"bytes=(\d{1,15})-(\d{0,15})", re.ASCII)
 _OPTIONS: dict[str, Any] = {
     "log_level": "error",
     "http": Connection,
@@ -152,7 +158,7 @@ class Viewer:
         )
 
     def _send_stream(self, request: Request) -> Response:
-        return stream_response(self._newest(), request)
+        return _stream_response(self._newest(), request)
 
     def _send_recorded(self, request: Request) -> Response:
         image = self._recorded.at(StreamReader(self._path, follow=False), **request.path_params)
@@ -174,3 +180,48 @@ class Viewer:
 async def _failed(_: Request, error: Exception) -> Response:
     text = str(error).encode(errors="replace")  # a name may have bytes that are not UTF-8
     return PlainTextResponse(text, 404 if isinstance(error, FileNotFoundError) else 400)
+
+
+def _stream_response(path: Path, request: Request) -> Response:
+    """Return the answer to a request of a file, or of a range of its bytes.
+
+    Bytes that are written meanwhile are left out. The entity tag stays the same while the stream
+    grows.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no stream, or no regular file.
+    """
+    file = open_regular(path, follow=False)  # `_parts` closes it
+    size = os.fstat(file.fileno()).st_size
+    start = file.read(PREAMBLE.size + PAYLOAD)
+    if not MAGIC.startswith(start[: len(MAGIC)]):
+        file.close()
+        raise ValueError(f"{path}: expected a stream, got another file; fit the capture again.")
+    # The tag has the inode and the checksums of the header and of the first frame.
+    length = 0
+    if len(start) == PREAMBLE.size + PAYLOAD:
+        length = HEAD.unpack_from(start, PREAMBLE.size)[2]
+    file.seek(min(len(start) + length, size))
+    etag = f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
+    location = quote(os.fsencode(path.name))
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": location}
+    part = range(size)
+    status = 200
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if match is not None and request.headers.get("if-range", etag) == etag:
+        part = part[int(match[1]) : int(match[2]) + 1 if match[2] else None]
+        status = 206
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+    if status == 206 and not part:
+        file.close()
+        return PlainTextResponse("", 416, {"Content-Range": f"bytes */{size}"})
+    # Without the number of bytes: a fit may truncate the file meanwhile, to go on from there.
+    return StreamingResponse(_parts(file, part), status, headers, "application/octet-stream")
+
+
+def _parts(file: BinaryIO, part: range) -> Iterator[bytes]:
+    with file:
+        file.seek(part.start)
+        for start in range(part.start, part.stop, _READ_SIZE):
+            yield file.read(min(_READ_SIZE, part.stop - start))

@@ -21,18 +21,25 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, decode_packet
+from morgs_mi.codec.container import TruncatedStreamError, decode_packet
 from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.files import locked_folder
 from morgs_mi.core.fit_names import REPORT, STREAM
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.playback.source import about_lenses, as_fitted
-from morgs_mi.runs.cluster.boundaries import COMMON_FRAMES, ChunkConfig
-from morgs_mi.runs.cluster.tasks import Chunk, Fit, Part, Source, fit_frames
+from morgs_mi.playback.stream_header import about_lenses, as_fitted
+from morgs_mi.runs.cluster.tasks import (
+    COMMON_FRAMES,
+    Chunk,
+    ChunkConfig,
+    Fit,
+    Part,
+    fit_frames,
+    recording_of,
+)
 from morgs_mi.runs.cluster.workers import installed, num_workers
 from morgs_mi.runs.fit_capture import Prepared
 from morgs_mi.runs.fit_files import (
@@ -41,10 +48,8 @@ from morgs_mi.runs.fit_files import (
     Recording,
     check_outputs,
     check_same_fit,
-    described_capture,
     interrupted_fit,
     read_reports,
-    restart_of,
     stream_metadata,
 )
 
@@ -125,7 +130,7 @@ class ChunkedRun:
         # First frames of chunks of about the same length, and the number of frames.
         starts = np.linspace(0, num_frames, chunks.count + 1)
         self.starts: list[int] = starts.round().astype(int).tolist()
-        self.task = Fit(Source.of(capture), config, chunks, str(mi.variant()), installed())
+        self.task = Fit(recording_of(capture), config, chunks, str(mi.variant()), installed())
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
         if chunks.count > 1:
             self.metadata["chunks"] = {"starts": self.starts[:-1], **asdict(chunks)}
@@ -156,7 +161,7 @@ class ChunkedRun:
             folder.mkdir(exist_ok=True)
             with ExitStack() as self.open_files:
                 self._fit_side_by_side(self._begun(Progress(self.on_stage)))
-            return self._joined(FitFiles.of(self.out))
+            return self._joined()
 
     def _begun(self, progress: Progress) -> list[Chunk]:
         """Return the chunks after the common model, which is fitted if it is missing."""
@@ -231,8 +236,7 @@ class ChunkedRun:
         if earlier is None:
             return Chunk(start, stop, start)
         self._open(start, earlier)
-        restart = restart_of(earlier.previous_state, earlier.last)
-        return Chunk(start, stop, start + len(earlier.reports), restart)
+        return Chunk(start, stop, start + len(earlier.reports), earlier.restart)
 
     def _open(self, start: int, earlier: Interrupted | None) -> None:
         """Open the files of a chunk."""
@@ -267,26 +271,13 @@ class ChunkedRun:
             return None
         return read_reports(self.out / REPORT, range(frames))
 
-    def _joined(self, files: FitFiles) -> list[FrameReport]:
+    def _joined(self) -> list[FrameReport]:
         """Join the chunks into one stream with its report."""
         starts = self.starts[:-1]
+        packets = (packet for start in starts for packet in StreamReader(self._files(start).stream))
         reports = [report for start in starts for report in self.recordings[start].reports]
-        new = files.next
-        assert new.description is not None
-        files.settle()
-        try:
-            with StreamWriter(
-                new.stream, self.capture.cameras, self.capture.fps, self.metadata
-            ) as writer:
-                for start in starts:
-                    for packet in StreamReader(self._files(start).stream):
-                        writer.write(packet)
-            rows = [asdict(report) for report in reports]
-            workers = {"workers": self.peaks} if len(starts) > 1 else {}
-            write_json(new.report, {**self.metadata, "frames": rows, **workers})
-            write_json(new.description, described_capture(self.capture, None))
-            files.replace_by_next()
-        finally:
-            files.settle()
+        workers = {"workers": self.peaks} if len(starts) > 1 else {}
+        with Recording(FitFiles.of(self.out), self.capture, self.metadata) as recording:
+            recording.extend(packets, reports, **workers)
         _remove(self.out / FOLDER)
         return reports

@@ -8,7 +8,6 @@ with the same result.
 from __future__ import annotations
 
 import logging
-import os
 import platform
 import socket
 import threading
@@ -24,6 +23,7 @@ import mitsuba as mi
 
 from morgs_mi.core.environment import versions
 from morgs_mi.core.interrupts import postponed
+from morgs_mi.core.threads import usable_cores
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -35,6 +35,26 @@ _SETTINGS = {
     "distributed.admin.large-graph-warning-threshold": "1GB",  # a task has the Gaussians before it
     # A worker that waits keeps its memory; one with too much is ended.
     "distributed.worker.memory.pause": False,
+}
+_LOST = (
+    ConnectionError,
+    "a scheduler that answers, but the connection was lost; start it again",
+)
+# Errors of Dask by the names of their classes, and what they mean.
+_FAULTS: dict[str, tuple[type[Exception], str]] = {
+    "KilledWorker": (
+        ChildProcessError,
+        "the workers to stay alive, but all died that ran one task, perhaps for lack of memory; "
+        "use fewer workers, or process smaller images",
+    ),
+    "CommClosedError": _LOST,
+    "ClosedClientError": _LOST,
+    "FutureCancelledError": _LOST,
+    "deserialization": (
+        ValueError,
+        "a scheduler and workers with the versions of this client, got others that cannot read its "
+        "tasks; install the same versions on all machines",
+    ),
 }
 _BUSY = threading.Lock()  # Dask runs several tasks at once in a worker with several threads
 
@@ -50,25 +70,16 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             core.
 
     Raises:
-        ValueError: the number or the address is not one, Dask is missing, or the workers have
-            another version of it.
-        ConnectionError: the scheduler does not answer, has no worker, or is lost later.
+        ValueError: Dask is missing, or the workers have another version of it.
+        ConnectionError: no scheduler answers at the address, it has no worker, or is lost later.
         ChildProcessError: the workers died that ran a task.
     """
-    if count is not None and count < 1:
-        raise ValueError(f"open_client(): `workers` must be at least 1, got {count}.")
-    if scheduler is not None and "://" not in scheduler:
-        raise ValueError(
-            "open_client(): `scheduler` must be an address such as tcp://host:8786, got "
-            f"{scheduler}."
-        )
     try:
         import dask.config
         import distributed
     except ImportError:
         raise ValueError(
-            "open_client(): several workers need the package distributed; pip install "
-            "'morgs-mi[cluster]'."
+            "open_client(): workers need the package distributed; pip install 'morgs-mi[cluster]'."
         ) from None
     for name in ("distributed", "distributed.client"):  # what concerns a fit is raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -77,12 +88,12 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         address: Any = scheduler
         if scheduler is None:
             resource_tracker.ensure_running()  # it would let the workers have Ctrl-C again
-            count = count or cores()
+            count = count or usable_cores()
             with postponed():
                 address = stack.enter_context(
                     distributed.LocalCluster(
                         n_workers=count,
-                        threads_per_worker=max(1, cores() // count),
+                        threads_per_worker=max(1, usable_cores() // count),
                         dashboard_address=":0",
                         silence_logs=logging.CRITICAL,
                     )
@@ -108,32 +119,17 @@ def _in_sentences(place: str) -> Iterator[None]:
         yield
     except (Exception, CancelledError) as error:
         name = type(error).__name__
-        if name == "KilledWorker":
-            raise ChildProcessError(
-                f"{place}: expected the workers to stay alive, but all died that ran one task, "
-                "perhaps for lack of memory; use fewer workers, or process smaller images."
-            ) from None
-        if name in ("CommClosedError", "ClosedClientError", "FutureCancelledError"):
-            raise ConnectionError(
-                f"{place}: expected a scheduler that answers, but the connection was lost; start "
-                "it again."
-            ) from None
         if isinstance(error, RuntimeError) and "deserialization" in str(error):
-            raise ValueError(
-                f"{place}: expected a scheduler and workers with the versions of this client, got "
-                "others that cannot read its tasks; install the same versions on all machines."
-            ) from None
-        raise
+            name = "deserialization"
+        if name not in _FAULTS:
+            raise
+        kind, fault = _FAULTS[name]
+        raise kind(f"{place}: expected {fault}.") from None
 
 
 def num_workers(client: Client) -> int:
     """Return the number of workers, which may change."""
     return len(client.scheduler_info(n_workers=-1).get("workers", ()))
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_name() -> str:
@@ -179,7 +175,7 @@ def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[li
         if mi.variant() != variant:
             mi.set_variant(variant)
         worker = _worker()
-        threads = cores() if worker is None else worker.state.nthreads
+        threads = usable_cores() if worker is None else worker.state.nthreads
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
             cv2.setNumThreads(threads)

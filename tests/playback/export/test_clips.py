@@ -71,7 +71,7 @@ def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
 @pytest.mark.parametrize("origin", [[1, 2], [1, 2, "3"], [1, 2, 1e13]])
 def test_stream_origin__refuses_others_than_three_numbers(tmp_path, origin):
     write_stream(tmp_path / "stream.morgs", metadata={"origin": origin})
-    with pytest.raises(ValueError, match=r"`origin` of the header's metadata must be three num"):
+    with pytest.raises(ValueError, match=r"`origin` .*must be"):
         stream_origin(StreamReader(tmp_path / "stream.morgs"))
 
 
@@ -212,16 +212,19 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     ("args", "message"),
     [
         (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
-        (("ply", "--frames", "a:b"), "--frames must be like 12, 10:20 or 0:100:5, got 'a:b'"),
+        (
+            ("ply", "--frames", "a:b"),
+            "--frames must be like 12, 10:20 or 0:100:5 and select frames of",
+        ),
         (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'."),
         (
             ("usd", "a.txt"),
-            "the output must be FILE.usdc, FILE.usd, FILE.usda or FILE.usdz, got '.txt'.",
+            "must be FILE.usdc or FILE.usd or FILE.usda or FILE.usdz, got '.txt'.",
         ),
         (
             ("ply", "a.glb"),
-            "must be a folder, FILE.ply for one frame, a folder ending in compressed-ply or "
-            "FILE.compressed.ply for one frame, got '.glb'.",
+            "must be FILE.ply or FILE.compressed.ply or a folder or a folder ending in "
+            "compressed-ply, got '.glb'.",
         ),
         (
             ("ply", "a.ply"),
@@ -230,10 +233,10 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         ),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
         (("video", "--width", "0"), "--width must be a number in [1, inf), got 0"),
-        (("video", "--seconds", "-1"), "--seconds must be positive"),
+        (("video", "--seconds", "-1"), "--seconds must be a number in (0, inf), got -1"),
         (
             ("video", "--least-seconds", "-1"),
-            "--least-seconds must be finite and not negative, got -1",
+            "--least-seconds must be a number in [0, inf), got -1",
         ),
         (("video", "--path", "none.json"), "expected a camera path, found none"),
     ],

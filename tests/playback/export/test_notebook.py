@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.playback.export import notebook
-from morgs_mi.playback.export.notebook import stream_html
-from morgs_mi.playback.export.web import web_page
+from morgs_mi.playback.export import web
+from morgs_mi.playback.export.web import stream_html, web_page
 from morgs_mi.playback.player import channel_image, render
 from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
@@ -36,7 +35,7 @@ def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a
 ):
     states = write_stream(tmp_path / "stream.morgs")
     stream = open_stream(tmp_path)
-    monkeypatch.setattr(notebook, "LARGEST", 1000)
+    monkeypatch.setattr(web, "LARGEST", 1000)
     text = stream_html(stream)
     assert f"morgs-mi export web {stream.path} page.html" in text
     source = re.search(r"base64,([^\"]+)", text)
@@ -51,7 +50,7 @@ def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a
 
 @pytest.mark.parametrize("largest", [0, 10**9])
 def test_stream_html__of_a_stream_that_does_not_play_says_why(tmp_path, monkeypatch, largest):
-    monkeypatch.setattr(notebook, "LARGEST", largest)
+    monkeypatch.setattr(web, "LARGEST", largest)
     with StreamWriter(tmp_path / "empty.morgs", rig(), 30):
         pass
     assert "expected at least one frame" in stream_html(open_stream(tmp_path / "empty.morgs"))

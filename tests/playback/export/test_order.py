@@ -8,7 +8,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.playback.export.order import by_place
+from morgs_mi.playback.export.clips import by_place
 from tests.scenes.changing_splats import rig, splats, write_stream
 
 

@@ -27,13 +27,12 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.fit_names import PROVISIONAL
 from morgs_mi.io.ply import write_ply
-from morgs_mi.playback.player import channel_image
-from morgs_mi.playback.player import render as render_channels
+from morgs_mi.playback.player import channel_image, picture
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.playback.viewer import connections
-from morgs_mi.playback.viewer import exact as exact_images
+from morgs_mi.playback.viewer import access
+from morgs_mi.playback.viewer import images as viewer_images
 from morgs_mi.playback.viewer.access import refusal
-from morgs_mi.playback.viewer.recorded import RecordedImages
+from morgs_mi.playback.viewer.images import RecordedImages
 from morgs_mi.playback.viewer.server import Viewer
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.studio.live.live_capture import write_images
@@ -209,8 +208,8 @@ def test_viewer__answers_many_connections_at_once(url, clip):
 
 
 def test_viewer__ends_connections_without_progress_and_beyond_a_limit(clip, monkeypatch):
-    monkeypatch.setattr(connections, "PATIENCE", 0.5)
-    monkeypatch.setattr(connections, "MOST", 8)
+    monkeypatch.setattr(access, "PATIENCE", 0.5)
+    monkeypatch.setattr(access, "MOST", 8)
     with viewing(clip[0]) as url:
 
         def begun() -> socket.socket:
@@ -392,14 +391,26 @@ VIEW = exact(1, "color", rig()[0]).partition("?")[2]
         (f"1/quats?{VIEW}", "expected a channel of the stream, got 'quats'"),
         (f"{'9' * 5000}/color?{VIEW}", "Exceeds the limit"),
         ("1/color?", "the JSON is broken"),
-        ("1/color?camera={}", "`camera.name` is missing"),
-        ("1/color?camera=" + "9" * 5000, "the JSON must have at most 4096 bytes"),
-        ("1/color?camera=[[[[NaN]]]]", "numbers must be finite, got NaN"),
-        (exact(1, "color", rig(4096, 4097)[0])[6:], "at most 16777216 pixels"),
-        (exact(1, "color", rig()[0], float("nan"))[6:], "expected a motion from 1e-12 to 1e+12"),
-        (exact(1, "motion", rig()[0], 1e-320)[6:], "expected a motion from 1e-12 to 1e+12"),
-        (exact(1, "motion", rig()[0], 1e300)[6:], "expected a motion from 1e-12 to 1e+12"),
-        (f"1/color?{VIEW.replace('near', 'far')}", "`camera.near` is missing"),
+        ("1/color?camera={}", "`camera.name` must be a string, got None"),
+        ("1/color?camera=" + "9" * 5000, "it must have at most 4096 bytes"),
+        ("1/color?camera=[[[[NaN]]]]", "got NaN"),
+        (
+            exact(1, "color", rig(4096, 4097)[0])[6:],
+            "`width * height` must be a number in [1, 16777216]",
+        ),
+        (
+            exact(1, "color", rig()[0], float("nan"))[6:],
+            "`motion_scale` must be a number in [1e-12, 1000000000000.0]",
+        ),
+        (
+            exact(1, "motion", rig()[0], 1e-320)[6:],
+            "`motion_scale` must be a number in [1e-12, 1000000000000.0]",
+        ),
+        (
+            exact(1, "motion", rig()[0], 1e300)[6:],
+            "`motion_scale` must be a number in [1e-12, 1000000000000.0]",
+        ),
+        (f"1/color?{VIEW.replace('near', 'far')}", "`camera.near` must be a number"),
     ],
 )
 def test_exact_images__refuse_what_the_stream_has_not_and_a_broken_view(url, path, message):
@@ -414,11 +425,11 @@ def test_exact_images__render_one_at_a_time_and_the_newest_wins(url, monkeypatch
     def render(*args):
         assert running.acquire(blocking=False), "two at once"
         try:
-            return render_channels(*args)
+            return picture(*args)
         finally:
             running.release()
 
-    monkeypatch.setattr(exact_images, "render", render)
+    monkeypatch.setattr(viewer_images, "picture", render)
     cameras = [rig(200 + n, 200)[0] for n in range(20)]
     with ThreadPoolExecutor(len(cameras)) as pool:
         answers = list(pool.map(lambda camera: get(url, exact(1, "color", camera)), cameras))

@@ -10,7 +10,7 @@ import pytest
 from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.boundaries import ChunkConfig, fit_boundary_frame
+from morgs_mi.runs.cluster.tasks import ChunkConfig, fit_boundary_frame
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.recording import CONFIG, recording
 

@@ -26,8 +26,8 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.boundaries import ChunkConfig
 from morgs_mi.runs.cluster.chunks import ChunkedRun
+from morgs_mi.runs.cluster.tasks import ChunkConfig
 from morgs_mi.runs.cluster.workers import open_client
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.runs.fit_files import FILES

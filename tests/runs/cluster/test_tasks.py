@@ -12,8 +12,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind, decode_packet
 from morgs_mi.codec.packets import reemitted_keyframe
-from morgs_mi.runs.cluster.boundaries import ChunkConfig
-from morgs_mi.runs.cluster.tasks import Chunk, Fit, Source, fit_frames
+from morgs_mi.runs.cluster.tasks import Chunk, ChunkConfig, Fit, fit_frames, recording_of
 from morgs_mi.runs.cluster.workers import installed
 from tests.scenes.recording import CONFIG, write_recording
 
@@ -21,7 +20,7 @@ from tests.scenes.recording import CONFIG, write_recording
 @pytest.fixture(scope="module")
 def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
     capture = load_capture(write_recording(tmp_path_factory.mktemp("clip"), 5))
-    return Fit(Source.of(capture), CONFIG, ChunkConfig(), str(mi.variant()), installed())
+    return Fit(recording_of(capture), CONFIG, ChunkConfig(), str(mi.variant()), installed())
 
 
 @pytest.mark.slow
@@ -30,7 +29,7 @@ def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
 ) -> None:
     first = fit_frames(fit, Chunk(0, 5, 0), 3)
     assert first.chunk == replace(first.chunk, start=0, stop=5, frame=3)
-    monkeypatch.setattr(Source, "open", None)
+    monkeypatch.setattr(Fit, "open", None)
     result = fit_frames(fit, first.chunk, 5)
     monkeypatch.undo()
     again = fit_frames(fit, first.chunk, 5)
@@ -61,7 +60,7 @@ def test_fit_frames__refuses_other_versions(fit: Fit) -> None:
         fit_frames(replace(fit, versions=versions), Chunk(0, 1, 0), 1)
 
 
-def test_source__opens_the_capture_as_it_is(tmp_path: Path) -> None:
+def test_recording_of__opens_the_capture_as_it_is(tmp_path: Path) -> None:
     capture = load_capture(write_recording(tmp_path, 5), 1.0, "cam1", 4)
-    again = Source.of(capture).open()
+    again = recording_of(capture)()
     assert (again.num_frames, again.test_views, again.names) == (4, (1,), capture.names)
