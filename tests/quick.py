@@ -13,7 +13,6 @@ from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.render.render_config import RenderConfig
 
 NO_DENSITY = DensityConfig(rounds=0, later_frames=False)
 FIT = FitConfig(
@@ -25,7 +24,6 @@ FIT = FitConfig(
     density=DensityConfig(rounds=0),
 )
 MOTION = MotionConfig(key_views=1)
-REPRODUCIBLE = RenderConfig(reproducible=True)
 # The same for the command line, as far as it has options.
 OPTIONS = ["--num-gaussians", "80", "--first-frame-steps", "8", "--epochs", "1", "--sh-degree", "0"]
 # A settings file with short fits for the refinement of cameras and for exposures.
@@ -34,7 +32,6 @@ SHORT_FITS = "[fit.short_fits]\ngaussians = 400\nsteps = 30\nrounds = 1\n"
 
 def quick(
     motion: MotionConfig = MOTION,
-    render: RenderConfig = REPRODUCIBLE,
     codec: CodecConfig | None = None,
     **fit: Any,
 ) -> StreamConfig:
@@ -42,8 +39,7 @@ def quick(
 
     Args:
         motion: another configuration of the motion.
-        render: another one of the renderer.
         codec: another one of the codec.
         **fit: changed fields of `FitConfig`.
     """
-    return StreamConfig(replace(FIT, **fit), motion, render, codec or CodecConfig())
+    return StreamConfig(replace(FIT, **fit), motion, codec=codec or CodecConfig())

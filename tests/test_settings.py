@@ -57,7 +57,6 @@ VALUES: dict[str, Any] = {
 }
 # Fields that cannot change this stream, each with the reason and the test that shows that it acts.
 ELSEWHERE: dict[str, str] = {
-    "render.reproducible": "acts on a GPU only: tests/test_gpu.py",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
     "fit.camera_priors": "the recorder refines cameras: tests/studio/calibration/test_bundle.py",

@@ -42,7 +42,6 @@ QUICK = quick(  # from all points, as the images were made of them
     epochs=4,
     density=NO_DENSITY,
 )
-REPRODUCIBLE = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
 SHORT = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
 
 
@@ -182,7 +181,7 @@ def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
     """Packets do not depend on later frames, to the byte where sums have a fixed order."""
     density = DensityConfig(rounds=2, births=0.05, min_error=0)
     fit = dataclasses.replace(QUICK.fit, density=density, first_frame_steps=40)
-    config = dataclasses.replace(QUICK, fit=fit, render=RenderConfig(reproducible=True))
+    config = dataclasses.replace(QUICK, fit=fit)
     dark = [clip[0], clip[1], [np.zeros_like(image) for image in clip[2]]]
     runs = [[packet.encoded for packet in run(frames, config)[1]] for frames in (clip, dark)]
     assert runs[0][:2] == runs[1][:2]
@@ -493,7 +492,7 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
 @pytest.mark.slow
 def test_push__skipping_static_views_costs_no_quality(clip):
     """The held-out image is as good in the mean of three seeds, in fewer bytes."""
-    some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
+    some = QUICK
     quality = np.zeros((3, 2))
     sizes = np.zeros((3, 2))
     for seed in range(3):
@@ -566,7 +565,7 @@ def pushed_ahead(loop, clip, upcoming):
 @pytest.fixture(scope="module")
 def reproducible(clip):
     """The first frame with sums of a fixed order."""
-    return run(clip, dataclasses.replace(QUICK, render=RenderConfig(reproducible=True)), frames=1)
+    return run(clip, QUICK, frames=1)
 
 
 @pytest.fixture(scope="module")
@@ -590,7 +589,7 @@ def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing
         "observe_frame",
         lambda *args: threads.append(threading.current_thread()) or observe(*args),
     )
-    loop = new_loop(dataclasses.replace(QUICK, render=RenderConfig(reproducible=True)))
+    loop = new_loop(QUICK)
     ahead = pushed_ahead(loop, clip, lambda images: [image.copy() for image in images])
     assert threads[0] is threading.main_thread()
     assert len(threads) == 4
@@ -621,7 +620,6 @@ EXPOSED = dataclasses.replace(
     fit=dataclasses.replace(
         QUICK.fit, exposure="on", short_fits=ShortFitConfig(gaussians=600, steps=60, rounds=2)
     ),
-    render=RenderConfig(reproducible=True),
 )
 
 
@@ -727,7 +725,7 @@ def test_push__leaves_no_arrays_to_the_garbage_collection(clip):
 @pytest.mark.slow
 def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
     """Dr.Jit turns the interruption into a RuntimeError; the loop is as it was before the frame."""
-    loop, other = (StreamLoop(cameras()[:4], *points_and_colors(), REPRODUCIBLE) for _ in range(2))
+    loop, other = (StreamLoop(cameras()[:4], *points_and_colors(), QUICK) for _ in range(2))
     packets = [other.push(images[:4])[0].encoded for images in clip[:2]]
     first, _ = loop.push(clip[0][:4])
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Float
-from morgs_mi.render.backend import on_cpu, sections
-from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
+from morgs_mi.render.backend import sections
+from morgs_mi.render.blocks import BlockLists, pack_records
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.loops import (
     Blocks,
     Layout,
     adjoint,
-    adjoint_of_pairs,
-    pair_packets,
     primal,
     record_packets,
     tangent,
@@ -70,7 +67,7 @@ class _Blend(dr.CustomOp):
         self.blocks = Blocks.of(
             region, lists, None if limits is None else on_region(limits, region)
         )
-        self.images = _run(primal, layout, self.blocks, lists.records, self._allocated())
+        self.images = recorded(primal, layout)(self.blocks, lists.records, self._allocated())
         return self._outputs(self.images)
 
     def backward(self) -> None:
@@ -88,8 +85,8 @@ class _Blend(dr.CustomOp):
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         tangents = pack_records(grads, self.lists.by_rank)
-        images = _run(
-            tangent, self.layout, self.blocks, self.lists.records, tangents, self._allocated()
+        images = recorded(tangent, self.layout)(
+            self.blocks, self.lists.records, tangents, self._allocated()
         )
         self.set_grad_out(self._outputs(images))
 
@@ -138,49 +135,36 @@ def _gradients(
     images' gradients.
     """
     N = dr.width(lists.by_rank)
-    arrays = (lists.records, images, grads)
     stride = 4 * record_packets(layout)
-    if layout.config.reproducible and not on_cpu():
-        end = dr.cumsum(lists.count)
-        first = end - lists.count
-        dr.eval(first)
-        pairs = dr.opaque(mi.Float, 0, max(int(end[-1]), 1) * 4 * pair_packets(layout))
-        pairs = _run(adjoint_of_pairs, layout, blocks, *arrays, first, pairs)
-        sums = _summed_by_rank(pairs, N, layout)
-        stride = 4 * pair_packets(layout)
-    else:
-        num_blocks = dr.width(lists.order)
-        launches, num_sections, lanes = sections(num_blocks)
-        sums = dr.opaque(mi.Float, 0, num_sections * N * stride)
-        # Dr.Jit adds in the order of the lanes within a section; the sections are added in theirs.
-        lane = dr.arange(mi.UInt32, num_sections * lanes)
-        first_record = dr.opaque(mi.UInt32, N) * quotient(lane, lanes)
-        dr.eval(first_record)
-        for launch in range(launches):
-            place = lane + dr.opaque(mi.UInt32, launch * num_sections * lanes)
-            is_block = place < dr.opaque(mi.UInt32, num_blocks)
-            order = dr.gather(mi.UInt32, lists.order, place, is_block)
-            order = dr.select(is_block, order, NO_SLOT)
-            dr.eval(order)
-            section_blocks = replace(blocks, order=order)
-            sums = _run(adjoint, layout, section_blocks, *arrays, first_record, sums)
-        place = dr.arange(mi.UInt32, N * stride)
-        parts = [
-            dr.gather(mi.Float, sums, place + dr.opaque(mi.UInt32, k * N * stride))
-            for k in range(num_sections)
-        ]
-        sums = sum(parts[1:], parts[0])
-        dr.eval(sums)
+    num_blocks = dr.width(lists.order)
+    launches, num_sections, lanes = sections(num_blocks)
+    sums = dr.opaque(mi.Float, 0, num_sections * N * stride)
+    # Dr.Jit adds in the order of the lanes within a section; the sections are added in theirs.
+    lane = dr.arange(mi.UInt32, num_sections * lanes)
+    first_record = dr.opaque(mi.UInt32, N) * quotient(lane, lanes)
+    dr.eval(first_record)
+    for launch in range(launches):
+        place = lane + dr.opaque(mi.UInt32, launch * num_sections * lanes)
+        is_block = place < dr.opaque(mi.UInt32, num_blocks)
+        order = dr.gather(mi.UInt32, lists.order, place, is_block)
+        order = dr.select(is_block, order, NO_SLOT)
+        dr.eval(order)
+        section_blocks = replace(blocks, order=order)
+        sums = recorded(adjoint, layout)(
+            section_blocks, lists.records, images, grads, first_record, sums
+        )
+    place = dr.arange(mi.UInt32, N * stride)
+    parts = [
+        dr.gather(mi.Float, sums, place + dr.opaque(mi.UInt32, k * N * stride))
+        for k in range(num_sections)
+    ]
+    sums = sum(parts[1:], parts[0])
+    dr.eval(sums)
     lane = lists.rank_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
     return [
         dr.gather(mi.Float, sums, lane + k) for k in range(start, layout.geometry + layout.columns)
     ]
-
-
-def _run(loop: Callable[..., Any], *arguments: Any) -> Any:
-    static = [v for v in arguments if isinstance(v, (Layout, int))]
-    return recorded(loop, *static)(*arguments[len(static) :])
 
 
 def _cropped(image: Float, region: Region, size: int) -> Float:
@@ -210,28 +194,3 @@ def padded(image: Float, region: Region, size: int) -> Float:
     column = lane - row * dr.opaque(mi.UInt32, region.row * size)
     width = dr.opaque(mi.UInt32, region.width * size)
     return dr.gather(mi.Float, image, row * width + column, active=column < width)
-
-
-def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
-    """Return the sums of the records of all pairs of each rank, one lane per rank, in the order of
-    the blocks.
-    """
-    packets = pair_packets(layout)
-    place = layout.geometry + layout.columns
-    lane = dr.arange(mi.UInt32, dr.width(pairs) // (4 * packets)) * (4 * packets)
-    rank = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, pairs, lane + place))
-    perm, _, first, end = sorted_buckets(dr.opaque(rank), N)
-
-    def add(k, sums, end, perm, pairs):
-        pair = dr.gather(mi.UInt32, perm, k) * packets
-        sums = [a + dr.gather(mi.Vector4f, pairs, pair + i) for i, a in enumerate(sums)]
-        return k + 1, sums, end, perm, pairs
-
-    state = (first, [mi.Vector4f(0) for _ in range(packets)], end, perm, pairs)
-    _, sums, *_ = dr.while_loop(state, lambda k, sums, end, *_: k < end, add, label="sum of pairs")
-    total = dr.empty(mi.Float, N * packets * 4)
-    lane = dr.arange(mi.UInt32, N) * packets
-    for i, packet in enumerate(sums):
-        dr.scatter(total, packet, lane + i, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(total)
-    return total

@@ -24,7 +24,6 @@ is a run of packets of 4 floats.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import log, log2
 
@@ -329,65 +328,9 @@ def adjoint(
         first_record: the record of rank 0 that each lane adds to, see `backend.sections`.
         sums: the records.
     """
+    block = _Block(layout, blocks)
     packets = record_packets(layout)
     mode = add_mode()
-
-    def add(sums: Float, grads: list[Float], rank: UInt32, first_record: UInt32) -> UInt32:
-        grads = [*grads, *_floats(packets * 4 - len(grads))]
-        for k in range(packets):
-            packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
-            place = (first_record + rank) * packets + k
-            dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, place, mode=mode)
-        return first_record
-
-    return _adjoint(layout, blocks, records, images, image_grads, first_record, sums, add)
-
-
-def adjoint_of_pairs(
-    layout: Layout,
-    blocks: Blocks,
-    records: Float,
-    images: list[Float],
-    image_grads: list[Float],
-    first_pair: UInt32,
-    pairs: Float,
-) -> Float:
-    """Write dL/d(record) of every pair of block and Gaussian, followed by the rank, to a section of
-    `pairs`.
-
-    `first_pair` [A] is the first pair of each block's section. Nothing depends on the order of
-    execution.
-    """
-    packets = pair_packets(layout)
-
-    def add(pairs: Float, grads: list[Float], rank: UInt32, pair: UInt32) -> UInt32:
-        grads = [*grads, dr.reinterpret_array(mi.Float, rank)]
-        grads += _floats(packets * 4 - len(grads))
-        for k in range(packets):
-            packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
-            dr.scatter(pairs, packet, pair * packets + k, mode=dr.ReduceMode.NoConflicts)
-        return pair + 1
-
-    pair = dr.gather(mi.UInt32, first_pair, blocks.order)
-    return _adjoint(layout, blocks, records, images, image_grads, pair, pairs, add)
-
-
-def pair_packets(layout: Layout) -> int:
-    """Return the number of packets of 4 floats of a pair's gradient and rank."""
-    return (layout.geometry + layout.columns) // 4 + 1
-
-
-def _adjoint(
-    layout: Layout,
-    blocks: Blocks,
-    records: Float,
-    images: list[Float],
-    image_grads: list[Float],
-    place: UInt32,
-    target: Float,
-    add: Callable[[Float, list[Float], UInt32, UInt32], UInt32],
-) -> Float:
-    block = _Block(layout, blocks)
     geometric = layout.reaches_weights
     G = layout.geometry
     C = layout.columns
@@ -397,7 +340,7 @@ def _adjoint(
         for g, v in zip(gradients, _load(block, layout, images), strict=True)
     ]
 
-    def body(walk, place, end, x, y, limits, T, S, g, records, words, entries, target):
+    def body(walk, end, x, y, limits, T, S, g, records, words, entries, first_record, sums):
         rank, walk = _advance(walk, end, words, entries)
         record = fetch_record(records, rank, G + C)
         geometry = record[:G]
@@ -432,20 +375,26 @@ def _adjoint(
             mean_grads, profile_grads = cut.gradients()
             total_grads = [a + b for a, b in zip(geometry_grads, mean_grads, strict=False)]
             geometry_grads = [*total_grads, *geometry_grads[2:], *profile_grads]
-        place = add(target, [*geometry_grads, *value_grads], rank, place)
-        return walk, place, end, x, y, limits, T_next, S_next, g, records, words, entries, target
+        grads = [*geometry_grads, *value_grads]
+        grads += _floats(packets * 4 - len(grads))
+        for k in range(packets):
+            packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
+            place = (first_record + rank) * packets + k
+            dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, place, mode=mode)
+        next_state = (walk, end, x, y, limits, T_next, S_next, g, records, words, entries)
+        return *next_state, first_record, sums
 
     T = _floats(block.area, 1.0)
     suffix = suffix if geometric else []
-    walk = (block.walk, place, block.end, block.x, block.y, block.limits)
-    state = (*walk, T, suffix, gradients, records, blocks.words, blocks.entries, target)
-    *_, target = dr.while_loop(
-        state,
-        lambda walk, place, end, x, y, limits, T, *_: block.continues(walk, T),
+    walk = (block.walk, block.end, block.x, block.y, block.limits)
+    lists = (records, blocks.words, blocks.entries)
+    *_, sums = dr.while_loop(
+        (*walk, T, suffix, gradients, *lists, first_record, sums),
+        lambda walk, end, x, y, limits, T, *_: block.continues(walk, T),
         body,
         label="blend (adjoint)",
     )
-    return target
+    return sums
 
 
 def _inner(g: list[Float], values: list[Float], layout: Layout, alpha: Float | None) -> Float:

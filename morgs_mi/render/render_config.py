@@ -37,9 +37,6 @@ class RenderConfig:
     None: 8 on the CPU, 4 on the GPU."""
     block_height: Annotated[int, Ge(1), Le(16)] | None = None
     """Height in pixels of that block, 1 to 16; None: 4."""
-    reproducible: bool = True
-    """Sum gradients in a fixed order on a GPU too: the same bytes on every run, for 48 bytes of
-    memory for every pair of Gaussian and block. The CPU's order is fixed, by its threads."""
 
     def __post_init__(self) -> None:
         if self.alpha_min >= self.alpha_max:

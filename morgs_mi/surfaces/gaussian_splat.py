@@ -37,7 +37,6 @@ _SETTINGS = (
     "stop_transmittance",
     "antialiased",
     "first_order_motion",
-    "reproducible",
 )
 
 
@@ -220,10 +219,6 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
      * - first_order_motion
        - |bool|
        - Whether `motion` is linear in the displacement, as in the MoRGS paper. (Default: False)
-
-     * - reproducible
-       - |bool|
-       - Whether gradients are summed in a fixed order on a GPU, as on the CPU. (Default: True)
 
      * - surfaces
        - |integrator|

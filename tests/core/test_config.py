@@ -102,7 +102,7 @@ def round_trip(config: Any, path: Path) -> Any:
                 density=DensityConfig(rounds=0, births=1 / 3), rates=LearningRates(means=1e-300)
             ),
             motion=MotionConfig(mask_method="none", cohesion_weight=1e22),
-            render=RenderConfig(block_width=4, block_height=None, reproducible=True),
+            render=RenderConfig(block_width=4, block_height=None),
             codec=CodecConfig(quality=0.1 + 0.2),
             seed=3,
         ),

@@ -21,7 +21,6 @@ from morgs_mi.render.active_view import ActiveView
 from tests.assertions import assert_close
 from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem, views
 
-REPRODUCIBLE = RenderConfig(reproducible=True)
 NO_GROWTH = DensityConfig(rounds=0)
 CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=NO_GROWTH)
 
@@ -220,7 +219,7 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12)
 
     def fitted(changes):
-        return fit(changes, ball(60, 1), config, masks=masks, render=REPRODUCIBLE)
+        return fit(changes, ball(60, 1), config, masks=masks)
 
     assert values_of(fitted(spoiled).gaussians) == values_of(fitted(images).gaussians)
 
@@ -265,8 +264,7 @@ def test_fit_first_frame__keeps_the_confidence(images):
 def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images):
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12, dropping=0.2)
     first, second, other = (
-        values_of(fit(images, ball(60, 1), config, seed, render=REPRODUCIBLE).gaussians)
-        for seed in (5, 5, 6)
+        values_of(fit(images, ball(60, 1), config, seed).gaussians) for seed in (5, 5, 6)
     )
     assert first == second
     assert first != other

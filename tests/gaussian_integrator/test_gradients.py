@@ -204,7 +204,7 @@ def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
 def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     """With the same settings, in a fixed order, and through a film that changes nothing."""
     film = {"rfilter": {"type": "box"}}
-    scene = make_mitsuba_scene(to_gaussians(raw), film, srgb_primitives=False, reproducible=True)
+    scene = make_mitsuba_scene(to_gaussians(raw), film, srgb_primitives=False)
     params = mi.traverse(scene)
     camera = make_sensor_camera()
     weight = mi.TensorXf(
@@ -226,9 +226,7 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     )
     camera = gaussian_splat._sensor_camera(scene.sensors()[0], border=0)
     plugin = gradients(mi.render(scene, params))
-    direct = gradients(
-        rasterize(splats, camera, ("color",), config=RenderConfig(reproducible=True)).color
-    )
+    direct = gradients(rasterize(splats, camera, ("color",), config=RenderConfig()).color)
     for name, by_plugin, by_rasterize in zip(names, plugin, direct, strict=True):
         np.testing.assert_array_equal(by_plugin, by_rasterize, err_msg=name)
 
@@ -246,7 +244,7 @@ def counting_renders(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_gaussian_splat__backward_uses_the_rendering_of_the_same_parameters(raw, monkeypatch):
-    scene = make_mitsuba_scene(to_gaussians(raw), reproducible=True)
+    scene = make_mitsuba_scene(to_gaussians(raw))
     params = mi.traverse(scene)
     opacities = params["gaussians.opacities"]
     dr.enable_grad(opacities)
@@ -270,7 +268,7 @@ def test_gaussian_splat__backward_renders_what_has_changed_since(raw):
     """
 
     def gradient(zoom: str) -> np.ndarray:
-        scene = make_mitsuba_scene(to_gaussians(raw), reproducible=True)
+        scene = make_mitsuba_scene(to_gaussians(raw))
         params = mi.traverse(scene)
         dr.enable_grad(params["gaussians.opacities"])
         for moment in ("before", "after"):

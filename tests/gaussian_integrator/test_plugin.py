@@ -287,7 +287,7 @@ def test_gaussian_splat__renders_a_batch_of_sensors_beside_each_other(raw):
 
 @pytest.mark.slow
 def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
-    scene, single_sensors = batch_scene(raw, {}, reproducible=True)
+    scene, single_sensors = batch_scene(raw, {})
     params = mi.traverse(scene)
     data = params["gaussians.data"]
     dr.enable_grad(data)

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from morgs_mi import RenderConfig, StreamLoop
+from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.files import locked_folder
 from morgs_mi.method.motion_config import MotionConfig
@@ -59,7 +59,7 @@ def test_run_demo__fits_the_first_frame_once(out: Path) -> None:
     first, plain = (next(iter(open_stream(out / name))) for name in ("stream", "stream_plain"))
     assert first.encoded == plain.encoded
     capture = load_capture(out / "capture")
-    config = replace(SMALL.stream, render=RenderConfig(reproducible=True))
+    config = SMALL.stream
     off = replace(
         config, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
     )
