@@ -28,15 +28,13 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
-from morgs_mi.loop.correction import Correction
-from morgs_mi.loop.first_frame import fitted_first_frame, with_first_confidence
+from morgs_mi.loop.first_frame import corrected, fitted_first_frame, with_first_confidence
 from morgs_mi.loop.frame_report import FittedFrame, FrameReport
 from morgs_mi.loop.image_status import image_status
 from morgs_mi.loop.input_images import Frame, as_array, in_order
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
-    Images,
     RecordedViews,
     Setup,
     extended_history,
@@ -45,10 +43,10 @@ from morgs_mi.loop.observation import (
     views_of,
 )
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
+from morgs_mi.method.active_set import find_active_set
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.motion import initial_motion
-from morgs_mi.method.objective import Observations, channels_of, observe
+from morgs_mi.method.objective import channels_of, observe
 from morgs_mi.method.ssim import Target
 
 _LOG = logging.getLogger(__name__)
@@ -69,8 +67,9 @@ class StreamState:
     #: State of a decoder after the last frame; None before the first.
     coded: CodedFrame | None = None
     history: ImageHistory = field(default_factory=ImageHistory)  #: Images up to the last frame.
-    #: Maps recorded images to the colours of the scene.
-    correction: Correction = field(default_factory=Correction)
+    #: Exposures of all views in the first frame, relative to the scene; empty if they are not
+    #: estimated.
+    exposures: tuple[Exposure, ...] = ()
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -118,30 +117,30 @@ def step(
     coded = decode(state.coded, fitted.packet)
     present = observation.history.images
     missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
+    problems = image_status([c.name for c in setup.cameras], state.history.images, present)
+    if state.coded is None:
+        for problem in problems:
+            _LOG.warning("frame 0: %s", problem)
+    sentences = [*([] if fitted.status == "ok" else [fitted.status]), *problems]
+    later_exposures = observation.history.exposures
     report = FrameReport(
         frame=frame,
         seconds=time.perf_counter() - start_time,
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
-        status=_status(setup, state, present, fitted.status),
+        status="; ".join(sentences) or "ok",
         missing_views=tuple(missing),
         active=fitted.active,
         validation=fitted.validation,
         steps=fitted.steps,
-        exposures=fitted.correction.followed_by(observation.history.exposures),
+        exposures=tuple(
+            later_exposures.get(v, Exposure()).after(first)
+            for v, first in enumerate(fitted.exposures)
+        ),
     )
-    next_state = StreamState(frame + 1, coded, observation.history, fitted.correction)
+    next_state = StreamState(frame + 1, coded, observation.history, fitted.exposures)
     return next_state, fitted.packet, report
-
-
-def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
-    """Return the status of a frame with the problems of its images, which are logged in frame 0."""
-    problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
-    if state.coded is None:
-        for problem in problems:
-            _LOG.warning("frame 0: %s", problem)
-    return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
 def _fit_later_frame(
@@ -160,12 +159,20 @@ def _fit_later_frame(
         # the residual of this frame.
         first_images = state.history.images
         previous = with_first_confidence(setup, previous, first_images, observation.flows, rng)
-    observations = observe(observation.key_views, motion, config.fit.objective)
-    active = _active_set(setup, previous, images, observation.changes, observations)
+    objective = config.fit.objective
+    observations = observe(observation.key_views, motion, objective)
+    active = find_active_set(
+        previous,
+        {v: setup.cameras[v] for v in images},
+        observation.changes,
+        {v: channels_of(observations.get(v, {}), objective) for v in images},
+        config.render,
+        motion.active_set,
+    )
     recorded = {view: observation.encoded[view] for view in active.views}
     targets = {
         view: Target(image, setup.masks[view])
-        for view, image in state.correction.corrected(recorded).items()
+        for view, image in corrected(recorded, state.exposures).items()
     }
     # The motion (eq. 5) starts from zero in the paper, and here from lifted flow and proposals.
     start = initial_motion(previous, active, observation.flows, targets, motion, rng)
@@ -177,29 +184,11 @@ def _fit_later_frame(
     packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, coder)
     return FittedFrame(
         packet=packet,
-        correction=state.correction,
+        exposures=state.exposures,
         losses=fitted.losses,
         steps=fitted.epochs * len(active.views),
         status="ok" if images else "no view has an image",
         active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
-    )
-
-
-def _active_set(
-    setup: Setup,
-    gaussians: Gaussians,
-    images: Images,
-    changes: Mapping[int, np.ndarray] | None,
-    observations: Mapping[int, Observations],
-) -> ActiveSet:
-    """Return the Gaussians and pixels that take part in a frame."""
-    config = setup.config
-    cameras = {v: setup.cameras[v] for v in images}
-    if changes is None:
-        return full_active_set(gaussians, cameras, config.render)
-    channels = {v: channels_of(observations.get(v, {}), config.fit.objective) for v in cameras}
-    return find_active_set(
-        gaussians, cameras, changes, channels, config.render, config.motion.active_set
     )
 
 
@@ -358,5 +347,5 @@ class StreamLoop:
         history = ImageHistory()
         for images in frames:
             history = extended_history(self.setup, coded.frame, history, images)
-        self.state = StreamState(coded.frame + 1, coded, history, Correction(tuple(exposures)))
+        self.state = StreamState(coded.frame + 1, coded, history, tuple(exposures))
         self._next_observation = None

@@ -47,7 +47,11 @@ def test_examples__write_a_picture(name, tmp_path, monkeypatch):
         from morgs_mi.method import objective
         from morgs_mi.method.method_registry import Registry
 
-        monkeypatch.setattr(objective, "LOSS_TERMS", Registry("ObjectiveConfig()", "terms"))
+        monkeypatch.setattr(
+            objective,
+            "LOSS_TERMS",
+            Registry("ObjectiveConfig()", "terms", objective.ObjectiveConfig),
+        )
     picture = run(name, tmp_path / "picture.png")
     assert picture.shape == (*reversed(SIZES[name]), 3)
     assert picture.std() > 5

@@ -165,7 +165,7 @@ def test_gaussian_splat__agrees_between_cuda_and_llvm_among_surfaces():
 def test_stream_loop__fits_two_frames_alike_on_cuda_and_llvm():
     """Steps amplify the rounding of sums, so the quality of the fits is compared."""
     changes = {"num_gaussians": 400, "first_frame_steps": 150, "confidence_steps": 20, "epochs": 4}
-    config = quick(MotionConfig(key_views=2), dropping=0.0, density=NO_DENSITY, **changes)
+    config = quick(MotionConfig(key_views=2), dropout=0.0, density=NO_DENSITY, **changes)
 
     def run():
         ball = opaque_ball()

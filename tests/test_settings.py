@@ -43,7 +43,7 @@ VALUES: dict[str, Any] = {
     "fit.objective.rotation_weight": 1.0,
     "fit.objective.isometry_weight": 1.0,
     "fit.early_stopping_tolerance": 0.5,
-    "fit.dropping": 0.3,
+    "fit.dropout": 0.3,
     "fit.density.max_gaussians": 1000,
     "fit.density.split_scale": 1.0,
     "fit.density.min_opacity": 0.4,

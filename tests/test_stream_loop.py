@@ -37,7 +37,7 @@ QUICK = quick(  # from all points, as the images were made of them
     RenderConfig(),
     num_gaussians=600,
     first_frame_steps=150,
-    dropping=0.0,
+    dropout=0.0,
     confidence_steps=20,
     epochs=4,
     density=NO_DENSITY,
@@ -517,7 +517,7 @@ def test_step__is_pure_and_complete(clip):
     """With default settings, called twice in a row and again from the same state; the caller's
     images may be reused.
     """
-    config = StreamConfig(fit=dataclasses.replace(QUICK.fit, first_frame_steps=60, dropping=None))
+    config = StreamConfig(fit=dataclasses.replace(QUICK.fit, first_frame_steps=60, dropout=None))
     setup = observation.prepare(cameras()[:4], *points_and_colors(), config)
     start = stream_loop.StreamState()
     buffers = [image.copy() for image in clip[0][:4]]

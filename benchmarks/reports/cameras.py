@@ -82,7 +82,7 @@ class Options(StudyOptions):
         fit = FitConfig(
             num_gaussians=self.gaussians,
             first_frame_steps=self.steps,
-            dropping=0.0,
+            dropout=0.0,
             refine_cameras="auto",
         )
         return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds)

@@ -65,7 +65,7 @@ class Options(ClipOptions):
                 for n, d in rigs.items()
             )
             scenes.append(Scene({"scene": f"random {seed}"}, (*clips, self.fitted, self.fit_seeds)))
-        return Study(measure, scenes, [Variant({}, self.config(dropping=0.0))])
+        return Study(measure, scenes, [Variant({}, self.config(dropout=0.0))])
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the errors of each scene's offsets, and PSNR where things move."""

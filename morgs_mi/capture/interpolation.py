@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import decode_light, encode_light
-from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.flow import consistency_mask
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 
 # Rounds of the fixed-point iteration: flow is smooth, so each round gains about a digit.
 _ROUNDS = 5
@@ -38,7 +38,7 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
     if has_light:
         first, second = (encode_light(image) for image in (first, second))
     pair = [np.clip(image, 0, 1) if has_light else image for image in (second, first)]
-    backward, forward = flow_source("dis")(FramePair(pair[0], pair[1]))
+    backward, forward = FLOW_SOURCES.make("dis")(FramePair(pair[0], pair[1]))
     first, first_weight = _contribution(first, forward, backward, share)
     second, second_weight = _contribution(second, backward, forward, 1 - share)
     mean = (first + second) / (first_weight + second_weight)

@@ -255,15 +255,15 @@ class Settings:
             FileNotFoundError: one of them names a missing file or folder.
             ValueError: one of them is unknown, or its network does not fit.
         """
-        from morgs_mi.method.flow_sources.flow_registry import flow_source
-        from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
-        from morgs_mi.method.motion_model import motion_model
+        from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
+        from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
+        from morgs_mi.method.motion_model import MOTION_MODELS
 
         motion = config.motion
         try:
-            flow_source(motion.flow_method, motion.flow)
-            mask_refiner(motion.mask_method, motion.masks)
-            motion_model(motion)
+            FLOW_SOURCES.make(motion.flow_method, motion.flow)
+            MASK_REFINERS.make(motion.mask_method, motion.masks)
+            MOTION_MODELS.make(motion.model, motion)
         except ValueError as error:
             names = {"motion.flow_method", "motion.mask_method", "motion.model"} - {*self.given()}
             if self.config is None or not names:

@@ -70,7 +70,7 @@ def balance_config(config: FitConfig) -> FitConfig:
         sh_degree=0,
         num_gaussians=how.gaussians,
         first_frame_steps=max(1, min(how.steps, config.planned_steps // _LEAST_SHARE)),
-        dropping=0.0,
+        dropout=0.0,
         density=replace(config.density, rounds=0),
     )
 
@@ -87,79 +87,53 @@ def balance_cameras(
         seed: of all random choices.
         progress: of the fits, in one stage.
     """
-    fits = _ShortFits(problem, config, seed, (progress or Progress()).of("Balancing cameras"))
+    report = (progress or Progress()).of("Balancing cameras")
+    how = config.short_fits
+    rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
+    visible, withheld = withheld_blocks(problem.views, how.width, rng)
+    short_config = balance_config(config)
+    steps = short_config.planned_steps
+    count = 0
+
+    def fitted(start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
+        """Return Gaussians after some steps, from a start, in the colours of the scene."""
+        nonlocal count
+        views = _corrected(visible, exposures)
+        fit_problem = replace(problem, start=start, views=tuple(views))
+        fit_config = replace(short_config, first_frame_steps=steps)
+        result = fit_first_frame(fit_problem, fit_config, rng_of(seed, Stream.BALANCE))
+        count += 1
+        report(count, how.rounds + _COMPARED)
+        return result.gaussians
+
     as_recorded = {v: Exposure() for v in range(len(problem.views))}
     exposures = as_recorded
     gaussians = problem.start
-    for k in range(config.short_fits.rounds):
-        gaussians = fits.fit(gaussians, exposures, -(-fits.steps // 2) if k else fits.steps)
-        exposures = fits.exposures_of(gaussians)
+    for k in range(how.rounds):
+        gaussians = fitted(gaussians, exposures, -(-steps // 2) if k else steps)
+        # Relative to the Gaussians, without what most cameras have in common.
+        exposures = centred(
+            {
+                v: fit_exposure(
+                    rendered(gaussians, camera, problem.render), unit_values(image), mask
+                )
+                for v, (camera, image, mask) in enumerate(visible)
+            }
+        )
         largest = max(exposure.change for exposure in exposures.values())
         if config.exposure == "auto" and largest < LEAST_DIFFERENCE:
             return Balance(tuple(exposures.values()), False)
     if config.exposure == "on":
         return Balance(tuple(exposures.values()), True)
-    return fits.compared(as_recorded, exposures)
-
-
-class _ShortFits:
-    """Short fits to images in the colours that exposures give them, without withheld pixels.
-
-    Attributes:
-        steps: number of steps of a fit from the start.
-    """
-
-    def __init__(
-        self, problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress
-    ) -> None:
-        rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
-        self._visible, self._withheld = withheld_blocks(problem.views, config.short_fits.width, rng)
-        self._problem = problem
-        self._config = balance_config(config)
-        self._seed = seed
-        self._progress = progress
-        self._count = 0
-        self._total = config.short_fits.rounds + _COMPARED
-        self.steps = self._config.planned_steps
-
-    def fit(self, start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
-        """Return Gaussians after some steps, from a start."""
-        views = _corrected(self._visible, exposures)
-        problem = replace(self._problem, start=start, views=tuple(views))
-        config = replace(self._config, first_frame_steps=steps)
-        gaussians = fit_first_frame(problem, config, rng_of(self._seed, Stream.BALANCE)).gaussians
-        self._count += 1
-        self._progress(self._count, self._total)
-        return gaussians
-
-    def exposures_of(self, gaussians: Gaussians) -> dict[int, Exposure]:
-        """Return the exposure of each camera relative to the Gaussians, without what most have in
-        common.
-        """
-        return centred(
-            {
-                v: fit_exposure(
-                    rendered(gaussians, camera, self._problem.render), unit_values(image), mask
-                )
-                for v, (camera, image, mask) in enumerate(self._visible)
-            }
-        )
-
-    def compared(
-        self, as_recorded: Mapping[int, Exposure], exposures: Mapping[int, Exposure]
-    ) -> Balance:
-        """Return the balance by the withheld pixels of fits without exposures and with them."""
-        recorded_psnr = self.withheld_psnr(as_recorded)
-        balanced_psnr = self.withheld_psnr(exposures)
-        is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
-        return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
-
-    def withheld_psnr(self, exposures: Mapping[int, Exposure]) -> float:
-        """Return the PSNR of the withheld pixels of a fit from the start, dB."""
-        gaussians = self.fit(self._problem.start, exposures, self.steps)
-        views = _corrected(self._withheld, exposures)
+    scores = []
+    for view_exposures in (as_recorded, exposures):
+        gaussians = fitted(problem.start, view_exposures, steps)
+        views = _corrected(withheld, view_exposures)
         some = [view for view in views if view.mask is not None and view.mask.any()]
-        return mean_psnr(gaussians, some, self._problem.render)
+        scores.append(mean_psnr(gaussians, some, problem.render))
+    recorded_psnr, balanced_psnr = scores
+    is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
+    return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
 
 
 def _corrected(views: Sequence[View], exposures: Mapping[int, Exposure]) -> list[View]:

@@ -5,7 +5,7 @@ The images ask for a number of Gaussians (see `detail`), and these for a number 
 (`FitConfig.planned_steps`). Where that would take longer than `FitConfig.first_frame_seconds`, the
 most Gaussians are chosen whose own number of steps fits the time. An eighth of those that the
 images ask for is the least, because pixels take time as well: from there on, the steps are reduced.
-Numbers that are given stay as they are.
+Numbers that are given stay as they are; `check_capacity` compares them with the free memory.
 
 The time of a step is modelled as
 
@@ -23,6 +23,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from morgs_mi.core.attributes import ATTRIBUTES
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.memory import check_memory
 from morgs_mi.fit.detail import with_num_gaussians
 from morgs_mi.fit.first_frame import LAST_ROUND
 from morgs_mi.fit.fit_config import FitConfig
@@ -35,6 +38,18 @@ _PIXEL_SECONDS = 0.5e-7
 _LEAST_STEPS = 100
 # The Gaussians that the images ask for, relative to the least that a time leaves.
 _LEAST_SHARE = 8
+# Arrays of each parameter: value, gradient and Adam's two moments.
+_ARRAYS = 4
+# Floats of a projected Gaussian.
+_PROJECTED = 40
+# Bytes of a float.
+_FLOAT = 4
+# Bytes of a pixel of a view: its image as bytes and as floats, and its reference.
+_PIXEL = 30
+# Gaussians for each pixel: far more than images determine, and such a fit would take days.
+_MOST = 16
+# Bytes of a step in the order of the views.
+_STEP = 16
 # Mean number of Gaussians while it grows from a half to all, relative to all.
 _GROWING = 0.75
 
@@ -68,8 +83,11 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
     if None not in (config.num_gaussians, config.first_frame_steps):
         return Plan(config)
     plan = with_num_gaussians(config, views, points)
-    pixels = _pixels(views)
-    half_pixels = _pixels(half_sized(views))
+    # Mean numbers of pixels of a view, and of one of half the size.
+    pixels, half_pixels = (
+        float(np.mean([view.camera.width * view.camera.height for view in some]))
+        for some in (views, half_sized(views))
+    )
 
     def seconds(plan: FitConfig) -> float:
         late_seconds = _step_seconds(plan.planned_gaussians, pixels)
@@ -102,6 +120,32 @@ def _step_seconds(count: float, pixels: float) -> float:
     return _GAUSSIAN_SECONDS * count + _PIXEL_SECONDS * pixels
 
 
-def _pixels(views: Sequence[View]) -> float:
-    """Return the mean number of pixels of a view."""
-    return float(np.mean([view.camera.width * view.camera.height for view in views]))
+def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> None:
+    """Raise an error unless there is memory for the numbers of Gaussians and of steps that a config
+    gives.
+
+    Args:
+        place: where the error's sentence begins.
+        cameras: the views.
+        config: settings.
+
+    Raises:
+        ValueError: there is not, or there are too many Gaussians for the pixels.
+    """
+    rest = 3 * ((config.sh_degree + 1) ** 2 - 1)
+    floats = sum(rest if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES)
+    gaussian_bytes = _FLOAT * (_ARRAYS * floats + _PROJECTED)
+    sizes = {"num_gaussians": gaussian_bytes, "first_frame_steps": _STEP}
+    for name, size in sizes.items():
+        count = getattr(config, name) or 0
+        check_memory(place, size * count, f"`{name}={count}`", "set a smaller number")
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    if (config.num_gaussians or 0) > _MOST * pixels:
+        raise ValueError(
+            f"{place}: `num_gaussians` must be at most {_MOST * pixels}, {_MOST} for each pixel of "
+            f"the views, got {config.num_gaussians}; set a smaller number."
+        )
+    views = f"{len(cameras)} views with {pixels} pixels"
+    check_memory(
+        place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras"
+    )

@@ -13,7 +13,7 @@ their tracks must not jump and the few remaining steps could not repair them; bi
 faint, and gain opacity or are pruned. Births that are not from splits along an axis are drawn from
 the density of their parents.
 
-Parents are the Gaussians with the largest densification scores (see `method.attribution`).
+Parents are the Gaussians with the largest densification scores (see `method.error_per_gaussian`).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
+from morgs_mi.fit.initialise import in_empty_space
 
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
@@ -57,11 +57,6 @@ class DensityPlan:
     source: np.ndarray  #: int [M], the same for survivors, -1 for births.
     #: Changes added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
     edits: dict[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def is_birth(self) -> np.ndarray:
-        """Which of them are births, bool [M]."""
-        return self.source < 0
 
 
 class Room(NamedTuple):
@@ -95,7 +90,8 @@ def plan_growth(
         cameras: the training cameras.
     """
     means = np.asarray(gaussians.means)
-    visible = _is_visible(gaussians, config) & ~in_empty_space(cameras, means)
+    opacities = np.asarray(gaussians.opacities)
+    visible = (opacities >= config.min_opacity) & ~in_empty_space(cameras, means)
     survivors, parents = _select(visible, scores, room, 0)
     parent = np.concatenate([survivors, parents])
     is_parent = np.isin(parent, parents)
@@ -104,43 +100,23 @@ def plan_growth(
     is_large = is_parent & (longest > config.split_scale * extent)
     is_halved = is_large & (longest > _LONG * second)
     is_shrunk = is_large & ~is_halved
-    logits = np.where(is_parent & ~is_shrunk, _logit_changes(gaussians, parent, is_halved), 0)
-    plan = _plan(gaussians, survivors, parents, np.where(is_shrunk, _LOG_SHRINK, 0), logits, rng)
-    _halve(plan, is_halved, np.asarray(gaussians.quats)[parent], scales)
-    shift = plan.edits["means"]
-    shift[in_empty_space(cameras, means[parent] + shift)] = 0
-    return plan
-
-
-def _is_visible(gaussians: Gaussians, config: DensityConfig) -> np.ndarray:
-    """Return the mask [N] of the Gaussians that are not pruned for their opacity."""
-    return np.asarray(gaussians.opacities) >= config.min_opacity
-
-
-def _logit_changes(gaussians: Gaussians, parent: np.ndarray, is_halved: np.ndarray) -> np.ndarray:
-    """Return the changes of the logits of the opacities [M] of both parts of each parent; those
-    with `is_halved` [M] are parts of a split one.
-    """
-    opacity = np.minimum(np.asarray(gaussians.opacities)[parent], _MAX_OPACITY)
+    opacity = np.minimum(opacities[parent], _MAX_OPACITY)
     new_opacity = np.where(is_halved, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
-    return _logit(new_opacity) - np.asarray(gaussians.logit_opacities)[parent]
-
-
-def _halve(plan: DensityPlan, is_halved: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> None:
-    """Edit a plan to place both parts of the split Gaussians along the longest axis.
-
-    Args:
-        plan: of M Gaussians.
-        is_halved: mask of both parts [M].
-        quats: of the parents [M, 4].
-        scales: of the parents [M, 3].
-    """
+    change = _logit(new_opacity) - np.asarray(gaussians.logit_opacities)[parent]
+    logits = np.where(is_parent & ~is_shrunk, change, 0)
+    plan = _plan(gaussians, survivors, parents, np.where(is_shrunk, _LOG_SHRINK, 0), logits, rng)
+    # Both parts of a split Gaussian lie along its longest axis.
     is_longest = np.eye(3, dtype=bool)[scales.argmax(axis=1)]
     side = np.where(plan.source < 0, _SPLIT_SHIFT, -_SPLIT_SHIFT)[:, None]
-    plan.edits["means"][is_halved] = _rotated(quats, side * is_longest * scales)[is_halved]
+    shift = plan.edits["means"]
+    shift[is_halved] = _rotated(np.asarray(gaussians.quats)[parent], side * is_longest * scales)[
+        is_halved
+    ]
     plan.edits["log_scales"][is_halved] = np.log(
         np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS)
     )[is_halved]
+    shift[in_empty_space(cameras, means[parent] + shift)] = 0
+    return plan
 
 
 def plan_additions(
@@ -162,7 +138,8 @@ def plan_additions(
     """
     births = round(config.births * (len(gaussians) + num_static))
     room = Room(births, max(config.max_gaussians - num_static, 0))
-    survivors, parents = _select(_is_visible(gaussians, config), scores, room, config.min_error)
+    visible = np.asarray(gaussians.opacities) >= config.min_opacity
+    survivors, parents = _select(visible, scores, room, config.min_error)
     is_birth = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(is_birth, _logit(_BIRTH_OPACITY) - logits, 0)

@@ -16,7 +16,7 @@ import numpy as np
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.rig import mean_views
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.noise import block_means, noise_of, whole_blocks
+from morgs_mi.fit.noise import block_means, noise_of
 from morgs_mi.fit.view import View
 
 # A value of a block follows from its mean and the other three.
@@ -58,18 +58,17 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     noise = _NOISE * noise_of(image)
     count = 0
     while min(values.shape[:2]) > 1:
-        values = whole_blocks(values)
         means = block_means(values)
-        fractions = block_means(whole_blocks(valid))
-        differences = np.abs(values - _repeated(means)).max(axis=-1)
-        is_detail = (differences > max(_THRESHOLD, noise)) & _repeated(fractions == 1)
+        fractions = block_means(valid)
+        # At each pixel of the blocks.
+        pixel_means, is_valid = (
+            v.repeat(2, axis=0).repeat(2, axis=1) for v in (means, fractions == 1)
+        )
+        height, width = is_valid.shape
+        differences = np.abs(values[:height, :width] - pixel_means).max(axis=-1)
+        is_detail = (differences > max(_THRESHOLD, noise)) & is_valid
         count += np.count_nonzero(is_detail)
         values = means
         valid = fractions
         noise = noise / 2
     return _INDEPENDENT * count
-
-
-def _repeated(values: np.ndarray) -> np.ndarray:
-    """Return the values of blocks at each pixel."""
-    return values.repeat(2, axis=0).repeat(2, axis=1)

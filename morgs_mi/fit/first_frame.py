@@ -7,7 +7,7 @@ is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 
@@ -22,8 +22,8 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.density import Room, plan_growth
-from morgs_mi.fit.dropping import dropped
+from morgs_mi.fit.density import DensityPlan, Room, plan_growth
+from morgs_mi.fit.dropout import dropped
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import (
     Steps,
@@ -35,8 +35,10 @@ from morgs_mi.fit.optimise import (
     view_order,
 )
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.method.attribution import densification_scores
+from morgs_mi.fit.view import half_sized
+from morgs_mi.method.error_per_gaussian import densification_scores
 from morgs_mi.method.losses import mask_loss, recon_loss
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
@@ -84,104 +86,51 @@ def fit_first_frame(
         progress: called with the numbers of steps made and of all steps.
         on_round: called with the Gaussians before each round of density control.
     """
-    fit = _FirstFrameFit(problem, config, rng, progress)
     steps = config.planned_steps
+    start = problem.start
+    # Steps before which a band is added; 3 times a thirtieth of 30 is 3, and not below.
+    bands = [int(band * steps * BAND + 1e-9) for band in range(1, start.sh_degree + 1)]
+    rounds = density_rounds(config)
+    parameters = start.parameters()
+    names = [a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters]
+    # The higher bands follow.
+    optimizer = adam({name: parameters[name] for name in names if name != "sh_rest"})
+    rates = config.first_frame_rates.by_parameter(problem.extent)
+    fit_views = half_sized(problem.views) if rounds else problem.views
+    views = [ActiveView(view.camera, problem.render) for view in fit_views]
+    targets = [Target(view.image, view.mask) for view in fit_views]
+
+    def losses_at(parameters: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+        gaussians = dropped(start.with_parameters(parameters), config.dropout or 0.0, rng)
+        image = views[view].render(gaussians, ("color",))
+        return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
+
     losses = {}
-    order = iter(view_order(len(problem.views), steps, rng))
-    for start, stop in fit.chunks(steps):
-        if on_round is not None and fit.has_round(start):
-            on_round(fit.gaussians)
-        fit.prepare(start)
-        losses = fit.run(islice(order, stop - start), start, steps)
-    return FirstFrame(fit.gaussians, losses, steps)
-
-
-class _FirstFrameFit:
-    """Optimiser of the first frame, and its events: SH bands and rounds of density control."""
-
-    def __init__(
-        self,
-        problem: FirstFrameProblem,
-        config: FitConfig,
-        rng: np.random.Generator,
-        progress: Progress | None,
-    ) -> None:
-        self._problem = problem
-        self._config = config
-        self._rng = rng
-        self._progress = progress
-        self._initial = problem.start
-        self._optimizer = adam(_first_parameters(problem.start))
-        self._rates = config.first_frame_rates.by_parameter(problem.extent)
-        # Steps before which a band is added; 3 times a thirtieth of 30 is 3, and not below.
-        self._bands = [
-            int(band * config.planned_steps * BAND + 1e-9)
-            for band in range(1, problem.start.sh_degree + 1)
-        ]
-        self._rounds = density_rounds(config)
-        self._use_views(problem.halved() if self._rounds else problem)
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The Gaussians with the current parameters."""
-        return self._initial.with_parameters(values_of(self._optimizer))
-
-    def chunks(self, steps: int) -> list[tuple[int, int]]:
-        """Return (first step, end) of the chunks of steps without an event."""
-        return list(pairwise(sorted({0, *self._bands, *self._rounds, steps})))
-
-    def has_round(self, step: int) -> bool:
-        """Return whether a round of density control is due before a step."""
-        return step in self._rounds
-
-    def prepare(self, step: int) -> None:
-        """Do what is due before a step: an SH band, a round of density control, larger images."""
-        for _ in range(self._bands.count(step)):
-            _add_band(self._optimizer, self._initial)
-        # Before the round, so that its scores come from the full images.
-        if self._rounds and step == self._rounds[-1]:
-            self._use_views(self._problem)
-        if self.has_round(step):
-            self._grow(len(self._rounds) - self._rounds.index(step))
-
-    def run(self, views: Iterable[int], first: int, steps: int) -> dict[str, float]:
-        """Make the steps of some views, from step `first` of `steps`; return the losses by name."""
-        progress = self._progress
-        chunk = Steps(
-            views,
+    order = iter(view_order(len(views), steps, rng))
+    for first, stop in pairwise(sorted({0, *bands, *rounds, steps})):
+        if on_round is not None and first in rounds:
+            on_round(start.with_parameters(values_of(optimizer)))
+        for _ in range(bands.count(first)):
+            _add_band(optimizer, start)
+        if first in rounds:
+            if first == rounds[-1]:  # its scores come from the full images already
+                views = [ActiveView(camera, problem.render) for camera in problem.cameras]
+                targets = [Target(view.image, view.mask) for view in problem.views]
+            gaussians = start.with_parameters(values_of(optimizer))
+            rounds_left = len(rounds) - rounds.index(first)
+            plan = _plan_round(gaussians, views, targets, rounds_left, problem, config, rng)
+            del gaussians  # tensors that the next steps would keep in memory
+            select_rows(optimizer, plan.parent, plan.source < 0, plan.edits)
+            start = start.select(plan.parent)
+        stretch = Steps(
+            islice(order, stop - first),
             first,
             rate_factor=lambda step: _FINAL_RATE ** (step / steps),
             on_step=None if progress is None else lambda count: progress(count, steps),
-            averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(self._views)),
+            averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )
-        return optimise(self._optimizer, self._rates, self._losses_at, chunk)
-
-    def _use_views(self, problem: FirstFrameProblem) -> None:
-        """Let the next steps fit the views of `problem`."""
-        self._views = [ActiveView(camera, problem.render) for camera in problem.cameras]
-        self._targets = [view.target for view in problem.views]
-
-    def _losses_at(self, parameters: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
-        gaussians = self._initial.with_parameters(parameters)
-        gaussians = dropped(gaussians, self._config.dropping or 0.0, self._rng)
-        image = self._views[view].render(gaussians, ("color",))
-        weight = self._config.objective.dssim_weight
-        return {"recon": recon_loss(image.color, self._targets[view], weight)}
-
-    def _grow(self, rounds_left: int) -> None:
-        """Add and prune Gaussians in the next of the rounds of density control that are left."""
-        gaussians = self.gaussians
-        config = self._config
-        planned = config.planned_gaussians
-        births = -(-max(planned - len(gaussians), 0) // rounds_left)
-        room = Room(births, limit=planned)
-        scores = densification_scores(gaussians, self._views, self._targets)
-        problem = self._problem
-        plan = plan_growth(
-            gaussians, scores, room, problem.extent, config.density, self._rng, problem.cameras
-        )
-        select_rows(self._optimizer, plan.parent, plan.is_birth, plan.edits)
-        self._initial = self._initial.select(plan.parent)
+        losses = optimise(optimizer, rates, losses_at, stretch)
+    return FirstFrame(start.with_parameters(values_of(optimizer)), losses, steps)
 
 
 def density_rounds(config: FitConfig) -> list[int]:
@@ -190,13 +139,28 @@ def density_rounds(config: FitConfig) -> list[int]:
     return sorted(set(steps.astype(int).tolist()))
 
 
-def _first_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Return the parameters that the first steps fit: all but the higher SH bands."""
-    parameters = gaussians.parameters()
-    names = [
-        a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters and a.name != "sh_rest"
-    ]
-    return {name: parameters[name] for name in names}
+def _plan_round(
+    gaussians: Gaussians,
+    views: Sequence[ActiveView],
+    targets: Sequence[Target],
+    rounds_left: int,
+    problem: FirstFrameProblem,
+    config: FitConfig,
+    rng: np.random.Generator,
+) -> DensityPlan:
+    """Return the plan of the next of the rounds of density control that are left."""
+    planned = config.planned_gaussians
+    births = -(-max(planned - len(gaussians), 0) // rounds_left)
+    scores = densification_scores(gaussians, views, targets)
+    return plan_growth(
+        gaussians,
+        scores,
+        Room(births, limit=planned),
+        problem.extent,
+        config.density,
+        rng,
+        problem.cameras,
+    )
 
 
 def _add_band(optimizer: Adam, base: Gaussians) -> None:

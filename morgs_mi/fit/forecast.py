@@ -5,9 +5,8 @@ overlap alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import ceil
-from typing import Any
 
 import numpy as np
 
@@ -61,11 +60,6 @@ class Forecast:
             f"{sentence} Cameras at most {int(_GOOD)} degrees apart would make them good: {more} "
             "more on an arc."
         )
-
-    @property
-    def entries(self) -> dict[str, Any]:
-        """Entries of the first frame's report: the attributes and the properties."""
-        return {"sentence": self.sentence, "quality": self.quality, **asdict(self)}
 
 
 def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:

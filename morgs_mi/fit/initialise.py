@@ -12,8 +12,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import BRIGHTEST, SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
-from morgs_mi.fit.empty_space import in_empty_space
+from morgs_mi.core.rig import focus_depths, in_image, scene_extent, seen_points
 from morgs_mi.fit.view import View
 
 Points = tuple[np.ndarray, np.ndarray]
@@ -96,14 +95,33 @@ def initial_points(
     elif num_points < _MANY_POINTS:
         points = fill_points(points, views, count, rng)
     cameras = [view.camera for view in views]
-    points = resample_points(_outside_empty_space(cameras, points), count, rng)
-    return _outside_empty_space(cameras, points)  # points between two others may lie there
+    for is_resampled in (False, True):
+        points = resample_points(points, count, rng) if is_resampled else points
+        # Also afterwards: points between two others may lie there.
+        is_empty = in_empty_space(cameras, points[0])
+        if not is_empty.all():
+            points = points[0][~is_empty], points[1][~is_empty]
+    return points
 
 
-def _outside_empty_space(cameras: Sequence[Camera], points: Points) -> Points:
-    """Return the points that are not in the empty space before the cameras; all, if all are."""
-    is_empty = in_empty_space(cameras, points[0])
-    return points if is_empty.all() else (points[0][~is_empty], points[1][~is_empty])
+def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
+    """Return the mask of means [N] that lie in the view of a camera, nearer than its near plane.
+
+    This camera does not render them, so that nothing moves them away. In front of other cameras
+    they are fog.
+
+    Args:
+        cameras: the training cameras.
+        means: [N, 3], world units.
+    """
+    mask = np.zeros(len(means), bool)
+    for camera in cameras:
+        forward = np.asarray(camera.viewmat, np.float64)[2]
+        depths = means @ forward[:3] + forward[3]
+        near = np.flatnonzero((depths > 0) & (depths < camera.near))
+        pixels, _ = camera.project(np.asarray(means[near], np.float64))
+        mask[near] |= in_image(camera, pixels)
+    return mask
 
 
 def _in_light(points: Points, views: Sequence[View]) -> Points:
@@ -114,20 +132,15 @@ def _in_light(points: Points, views: Sequence[View]) -> Points:
     hdr_views = [view for view in views if np.isinf(view.white)]
     if not hdr_views or not len(positions):
         return points
-    colors = np.stack([_recorded_colors(view, positions) for view in hdr_views])
+    colors = np.full((len(hdr_views), *positions.shape), np.nan)
+    for view, view_colors in zip(hdr_views, colors, strict=True):
+        visible, pixels, _ = seen_points(view.camera, positions)
+        columns, rows = pixels.astype(int).T
+        is_valid = np.ones(len(rows), bool) if view.mask is None else view.mask[rows, columns]
+        view_colors[visible] = np.where(is_valid[:, None], view.image[rows, columns], np.nan)
     unseen = np.isnan(colors).all(axis=(0, 2))
     colors[:, unseen] = own_colors[unseen]
     return positions, np.nanmedian(colors, axis=0)
-
-
-def _recorded_colors(view: View, points: np.ndarray) -> np.ndarray:
-    """Return the colours of points [P, 3] in a view, NaN where it does not show them."""
-    colors = np.full(points.shape, np.nan)
-    visible, pixels, _ = seen_points(view.camera, points)
-    columns, rows = pixels.astype(int).T
-    is_valid = np.ones(len(rows), bool) if view.mask is None else view.mask[rows, columns]
-    colors[visible] = np.where(is_valid[:, None], view.image[rows, columns], np.nan)
-    return colors
 
 
 def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drjit.opt import Adam
 
 from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
@@ -20,11 +18,18 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.motion_stage import fit_motion
 from morgs_mi.fit.optimise import Steps, adam, optimise, select_rows, values_of, view_order
 from morgs_mi.method.active_set import ActiveSet
-from morgs_mi.method.attribution import Attribution
+from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import motion_model
+from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
+from morgs_mi.method.objective import (
+    Observations,
+    Prediction,
+    channels_of,
+    losses_of,
+    terms_of,
+    weights_of,
+)
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.method.rigidity import Neighbours, find_neighbours
 from morgs_mi.method.ssim import Target
@@ -81,53 +86,41 @@ def fit_later_frame(
         rng: draws the order of the views and the positions of births.
         progress: called with the numbers of steps made and of all steps.
     """
-    previous = problem.previous
     active = problem.active
-    if not active.views or not len(active.indices):
-        return LaterFrame(at_rest(previous), np.arange(len(previous)), {}, 0)
+    num_views = len(active.views)
+    if not num_views or not len(active.indices):
+        count = len(problem.previous)
+        return LaterFrame(at_rest(problem.previous), np.arange(count), {}, 0)
     fit = _LaterFrameFit(problem, config, motion, rng, progress)
     latest_density_epoch = round(_LATEST_DENSITY_ROUND * config.epochs)
-    first_epoch = fit.fit_motion_model()
-    for epoch in range(first_epoch, config.epochs):
-        if fit.can_densify and (fit.has_converged or epoch >= latest_density_epoch):
+    tolerance = config.early_stopping_tolerance
+    objectives = []
+    for epoch in range(fit.steps // num_views, config.epochs):
+        # It may rise in a single epoch.
+        has_converged = (
+            tolerance > 0
+            and len(objectives) > 2
+            and objectives[-1] > (1 - tolerance) * objectives[-3]
+        )
+        # An epoch has shown where to add Gaussians.
+        if fit.scores is not None and (has_converged or epoch >= latest_density_epoch):
             fit.densify()
-        elif fit.has_converged:
+        elif has_converged:
             break
-        fit.run_epoch(epoch)
-    gaussians, source = active.merge(previous, fit.gaussians, fit.source)
-    return LaterFrame(gaussians, source, fit.losses, fit.steps // len(active.views))
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """An epoch: a step in every active view. The stage of a motion model may be several ones."""
-
-    first_step: int  #: Number of the first step.
-    stop: int  #: Number of the step after the last one.
-    #: Number of the first step that counts for densification scores, which are collected in the
-    #: last quarter: an error that is seen earlier may be gone by the end of the epoch.
-    first_scored_step: int
-
-    @classmethod
-    def after(cls, steps: int, num_views: int, count: int = 1) -> Epoch:
-        """Return the next `count` epochs after some steps."""
-        stop = steps + count * num_views
-        return cls(steps, stop, stop - (num_views + 3) // 4)
-
-    @property
-    def unscored_steps(self) -> int:
-        """Number of steps before the first one that counts for densification scores."""
-        return self.first_scored_step - self.first_step
+        objectives.append(fit.run_epoch(epoch))
+    gaussians, source = active.merge(problem.previous, fit.gaussians(), fit.source)
+    return LaterFrame(gaussians, source, fit.losses, fit.steps // num_views)
 
 
 class _LaterFrameFit:
     """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of
-    density control.
+    density control. An epoch is a step in every active view.
 
     Attributes:
         source: as in `LaterFrame`, among the active Gaussians.
         losses: mean losses of the last epoch, by name.
         steps: number of steps that were made.
+        scores: of the last epoch, for the round of density control; None where none is to come.
     """
 
     def __init__(
@@ -143,9 +136,10 @@ class _LaterFrameFit:
         self._motion = motion
         self._rng = rng
         self._progress = progress or Progress()
-        self._views = sorted(problem.active.views)
-        count = len(self._views)
-        self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
+        active = problem.active
+        views = sorted(active.views)
+        count = len(views)
+        self._order = [views[k] for k in view_order(count, config.epochs * count, rng)]
         # As tensors on the region of each active view.
         self._observations: dict[int, Observations] = {
             v: {"target": problem.targets[v]}
@@ -153,112 +147,80 @@ class _LaterFrameFit:
                 name: from_numpy(mi.TensorXf, view.crop(array))
                 for name, array in problem.observations.get(v, {}).items()
             }
-            for v, view in problem.active.views.items()
+            for v, view in active.views.items()
         }
-        self._previous = problem.active.select(problem.previous)
-        self._start = problem.start
-        self.source = np.arange(len(problem.active.indices))
+        self._previous = active.select(problem.previous)
         self._neighbours: Neighbours | None = None
-        # The round of density control is still to come, and the scores of the last epoch, which it
-        # needs.
         self._awaits_density_round = config.density.later_frames
-        self._scores: Attribution | None = None
-        self._objectives = list[float]()
+        self.source = np.arange(len(active.indices))
+        self.scores: ErrorPerGaussian | None = None
         self.losses = dict[str, float]()
         self.steps = 0
+        start = problem.start
+        factory = MOTION_MODELS.make(motion.model, motion)
+        if factory is not None:
+            epochs = max(1, round(motion.model_share * config.epochs))
+            start, self.losses = fit_motion(
+                MotionProblem(self._previous, active.views, problem.targets, rng),
+                factory(self._previous, problem.extent, rng),
+                start,
+                self._next_steps(epochs * count),
+                config.objective.dssim_weight,
+            )
+        parameters = residual_parameters(self._previous, motion, start)
+        self._optimizer = adam(parameters, config.momentum)
 
-    @property
     def gaussians(self) -> Gaussians:
-        """The active Gaussians after the residual."""
+        """Return the active Gaussians after the residual."""
         with dr.suspend_grad():
             return apply_residual(self._previous, values_of(self._optimizer), self._motion)
 
-    @property
-    def has_converged(self) -> bool:
-        """Whether the objective (eq. 13) decreased by less than the tolerance over the last two
-        epochs; it may rise in a single one.
+    def run_epoch(self, number: int) -> float:
+        """Make one step in every active view, at the rates of epoch `number`, and return the
+        objective (eq. 13).
         """
-        tolerance = self._config.early_stopping_tolerance
-        values = self._objectives
-        return tolerance > 0 and len(values) > 2 and values[-1] > (1 - tolerance) * values[-3]
-
-    def fit_motion_model(self) -> int:
-        """Fit the motion model, if there is one, and let the residual start from its motion; return
-        the number of epochs that it took.
-        """
-        factory = motion_model(self._motion)
-        if factory is None:
-            return 0
-        problem = self._problem
-        model = factory(self._previous, problem.extent, self._rng)
-        motion_problem = MotionProblem(
-            self._previous, problem.active.views, problem.targets, self._rng
-        )
-        epochs = max(1, round(self._motion.model_share * self._config.epochs))
-        steps = self._steps_of(self._next_epoch(epochs))
-        weight = self._config.objective.dssim_weight
-        self._start, self.losses = fit_motion(motion_problem, model, self._start, steps, weight)
-        return epochs
-
-    def run_epoch(self, number: int) -> None:
-        """Make one step in every active view, at the rates of epoch `number`."""
-        epoch = self._next_epoch()
+        config = self._config
+        num_views = len(self._problem.active.views)
         if self._awaits_density_round:
-            self._scores = Attribution(len(self.source), epoch.unscored_steps)
-        if self._neighbours is None and self._config.objective.is_rigid:
+            # Scores are collected in the last quarter: an error that is seen earlier may be gone by
+            # the end of the epoch.
+            self.scores = ErrorPerGaussian(len(self.source), num_views - (num_views + 3) // 4)
+        weights = weights_of(config.objective)
+        terms = [term for term in terms_of(config.objective) if weights[term.name]]
+        if self._neighbours is None and any("neighbours" in term.observations for term in terms):
             self._neighbours = find_neighbours(self._previous, self._problem.extent)
-        rates = self._config.rates_at(number).by_parameter(self._problem.extent)
-        weights = weights_of(self._config.objective)
-        steps = self._steps_of(epoch, self._scores)
+        rates = config.rates_at(number).by_parameter(self._problem.extent)
+        steps = self._next_steps(num_views)
         self.losses = optimise(self._optimizer, rates, self._losses_at, steps, weights)
-        self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
-
-    @property
-    def can_densify(self) -> bool:
-        """Whether a round of density control is to come, and an epoch has shown where to add
-        Gaussians.
-        """
-        return self._scores is not None
+        return sum(weights[name] * loss for name, loss in self.losses.items())
 
     def densify(self) -> None:
         """Add and prune active Gaussians by density control, once."""
-        assert self._scores is not None
+        assert self.scores is not None
         problem = self._problem
         num_static = len(problem.previous) - len(problem.active.indices)
         plan = plan_additions(
-            self.gaussians, self._scores.scores(), self._config.density, self._rng, num_static
+            self.gaussians(), self.scores.scores(), self._config.density, self._rng, num_static
         )
         # The optimiser has the residual, so the plan changes the previous Gaussians: a birth starts
         # from the past of its parent, and shares its residual.
         self._previous = apply_plan(self._previous, plan)
         self.source = plan.source
-        select_rows(self._optimizer, plan.parent, plan.is_birth)
+        select_rows(self._optimizer, plan.parent, plan.source < 0)
         self._neighbours = None
         self._awaits_density_round = False
-        self._scores = None
+        self.scores = None
 
-    @cached_property
-    def _optimizer(self) -> Adam:
-        """Optimiser of the residual of the active Gaussians, which begins at the start of their
-        motion.
-        """
-        parameters = residual_parameters(self._previous, self._motion, self._start)
-        return adam(parameters, self._config.momentum)
-
-    def _next_epoch(self, count: int = 1) -> Epoch:
-        """Return the next epochs, and count their steps."""
-        epoch = Epoch.after(self.steps, len(self._views), count)
-        self.steps = epoch.stop
-        return epoch
-
-    def _steps_of(self, epoch: Epoch, scores: Attribution | None = None) -> Steps:
-        """Return the steps of an epoch, which collect densification scores, if any."""
+    def _next_steps(self, count: int) -> Steps:
+        """Return the next steps, which collect densification scores, if any, and count them."""
+        first = self.steps
+        self.steps += count
         return Steps(
-            views=self._order[epoch.first_step : epoch.stop],
-            first_step=epoch.first_step,
+            views=self._order[first : self.steps],
+            first_step=first,
             on_step=lambda step: self._progress(step, len(self._order)),
-            observer=scores,
-            averaged_steps=len(self._views),
+            observer=self.scores,
+            averaged_steps=len(self._problem.active.views),
         )
 
     def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
@@ -271,14 +233,13 @@ class _LaterFrameFit:
             observations["neighbours"] = self._neighbours
         channels = channels_of(observations, objective)
         gaussians = apply_residual(self._previous, parameters, self._motion)
-        features = None if self._scores is None else self._scores.features()
+        features = None if self.scores is None else self.scores.features()
         # Motion, confidence and scores must not move opacity and geometry.
-        detached_channels = [name for name in channels if name != "color"]
-        if features is not None:
-            detached_channels.append("features")
+        names = channels if features is None else (*channels, "features")
+        detached_channels = [name for name in names if name != "color"]
         image = view.render(gaussians, channels, detached_channels, features)
-        if self._scores is not None and features is not None:
-            self._scores.observe(image, problem.targets[index], view.region)
+        if self.scores is not None and features is not None:
+            self.scores.observe(image, problem.targets[index], view.region)
         num_pixels = view.camera.width * view.camera.height
         num_gaussians = problem.active.num_gaussians
         prediction = Prediction(

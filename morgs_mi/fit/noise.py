@@ -48,18 +48,15 @@ def white_noise_of(image: np.ndarray) -> float:
     """
     if min(image.shape[:2]) < 2:
         return 0.0
-    half = block_means(whole_blocks(image).astype(np.float32))
+    half = block_means(image.astype(np.float32))
     half = half / 255 if image.dtype == np.uint8 else half
     return float(np.sqrt(max(4 / 3 * (noise_of(image) ** 2 - noise_of(half) ** 2), 0)))
 
 
-def whole_blocks(values: np.ndarray) -> np.ndarray:
-    """Return an image without the last row or column where their number is odd."""
-    height, width = (size // 2 for size in values.shape[:2])
-    return values[: 2 * height, : 2 * width]
-
-
 def block_means(values: np.ndarray) -> np.ndarray:
-    """Return the means of the blocks of 2x2 pixels of an image of whole blocks."""
+    """Return the means of the blocks of 2x2 pixels of an image, without the last row or column
+    where their number is odd.
+    """
     height, width = (size // 2 for size in values.shape[:2])
-    return cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+    whole = values[: 2 * height, : 2 * width]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)

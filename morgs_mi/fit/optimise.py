@@ -91,11 +91,8 @@ class Observer(Protocol):
     joins the loss, and the gradients are collected.
     """
 
-    def term(self) -> Tensor | None:
-        """Return a term of value 0, which joins the losses of the step in its backward pass; None:
-        no term.
-        """
-        ...
+    term: Tensor | None
+    """Term of value 0, which joins the losses of the step in its backward pass; None: no term."""
 
     def collect(self) -> None:
         """Read the gradients of the term, after the backward pass."""
@@ -149,7 +146,7 @@ def optimise(
             optimizer.set_learning_rate({name: factor * rate for name, rate in base_rates.items()})
         losses = losses_at(optimizer, view)
         total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
-        term = None if steps.observer is None else steps.observer.term()
+        term = None if steps.observer is None else steps.observer.term
         with render_lock:
             dr.backward(total if term is None else total + term)
         if steps.observer is not None:
@@ -176,7 +173,5 @@ def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int
     """Return the views of `steps` steps in random order: each is drawn once before any is drawn
     again.
     """
-    if steps == 0:
-        return []
     epochs = -(-steps // num_views)
-    return np.concatenate([rng.permutation(num_views) for _ in range(epochs)])[:steps].tolist()
+    return [int(view) for _ in range(epochs) for view in rng.permutation(num_views)][:steps]

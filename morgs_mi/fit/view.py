@@ -11,7 +11,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
@@ -41,11 +40,6 @@ class View(NamedTuple):
     def white(self) -> float:
         """Value at which the recording was clipped: 1, or infinity for an HDR recording."""
         return 1.0 if self.image.dtype == np.uint8 else np.inf
-
-    @property
-    def target(self) -> Target:
-        """The image as a fit compares with it."""
-        return Target(self.image, self.mask)
 
     def reduced(self, width: int) -> View:
         """Return the view reduced by the largest whole factor that leaves a width.
@@ -91,16 +85,6 @@ def withheld_blocks(
     return visible, withheld
 
 
-def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:
-    """Return the mean square error of each view [V], of its valid pixels."""
-    errors = []
-    for view in views:
-        image = rendered(gaussians, view.camera, render, view.white)
-        squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
-        errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
-    return np.array(errors)
-
-
 def rendered(
     gaussians: Gaussians, camera: Camera, render: RenderConfig, white: float = 1.0
 ) -> np.ndarray:
@@ -110,11 +94,11 @@ def rendered(
     )
 
 
-def decibels(squares: np.ndarray) -> np.ndarray:
-    """Return the PSNR of mean square errors, dB."""
-    return -10 * np.log10(np.maximum(squares, 1e-10))
-
-
 def mean_psnr(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> float:
     """Return the mean PSNR of some views in dB, of their valid pixels."""
-    return float(decibels(squared_errors(gaussians, views, render)).mean())
+    errors = []
+    for view in views:
+        image = rendered(gaussians, view.camera, render, view.white)
+        squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
+        errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
+    return float((-10 * np.log10(np.maximum(errors, 1e-10))).mean())

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -12,16 +15,17 @@ from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
+from morgs_mi.fit.balance import balance_cameras, balance_config
 from morgs_mi.fit.budget import plan_first_frame
-from morgs_mi.fit.dropping import adapted_to_images
+from morgs_mi.fit.dropout import adapted_to_images
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.loop.correction import estimate_correction
 from morgs_mi.loop.frame_report import FittedFrame
 from morgs_mi.loop.observation import FrameObservation, Images, Setup, views_of
 from morgs_mi.method.confidence import motion_mask
+from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
 
 _LOG = logging.getLogger(__name__)
@@ -42,18 +46,18 @@ def fitted_first_frame(
         on_provisional: called with provisional keyframes during the fit; None: there are none.
     """
     config = setup.config
-    correction, correction_entry = estimate_correction(setup, observed.encoded, progress)
-    views = views_of(setup, correction.corrected(observed.encoded))
+    exposures, exposure_entry = _balanced(setup, observed.encoded, progress)
+    views = views_of(setup, corrected(observed.encoded, exposures))
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan = plan_first_frame(views, setup.points, config.fit)
-    problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
+    cloud = setup.points, setup.point_colors
+    problem = FirstFrameProblem.of(views, cloud, plan.config, config.render, rng)
     fit_config = adapted_to_images(plan.config, problem)
 
-    on_round = (
-        None
-        if on_provisional is None
-        else lambda gaussians: on_provisional(_packet(setup, gaussians))
-    )
+    packet_of = partial(keyframe_packet, frame=0, cameras=setup.cameras, config=config.codec)
+    on_round = None
+    if on_provisional is not None:
+        on_round = lambda gaussians: on_provisional(packet_of(gaussians))  # noqa: E731
     status = "ok"
     if (count := len(setup.points)) < MIN_POINTS:
         status = (
@@ -61,20 +65,55 @@ def fitted_first_frame(
             "ones inside the views"
         )
         _LOG.warning("frame 0: %s", status)
-    expected = forecast(problem.cameras, problem.points).entries if len(views) > 1 else {}
+    validation: dict[str, Any] = {}
+    if len(views) > 1:
+        expected = forecast(problem.cameras, problem.points)
+        quality = {"sentence": expected.sentence, "quality": expected.quality}
+        validation = {**quality, **asdict(expected), **exposure_entry}
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
     return FittedFrame(
-        packet=_packet(setup, fitted.gaussians),
-        correction=correction,
+        packet=packet_of(fitted.gaussians),
+        exposures=exposures,
         losses=fitted.losses,
         steps=fitted.steps,
         status=status,
-        validation=expected | correction_entry,
+        validation=validation,
     )
 
 
-def _packet(setup: Setup, gaussians: Gaussians) -> Packet:
-    return keyframe_packet(gaussians, 0, setup.cameras, setup.config.codec)
+def _balanced(
+    setup: Setup, images: Images, progress: Progress
+) -> tuple[tuple[Exposure, ...], dict[str, Any]]:
+    """Return the exposures of all views by the balance of the cameras, empty if they are not
+    estimated, and the entry of the first frame's report; `images` are those of the first frame.
+    """
+    config = setup.config
+    if config.fit.exposure == "off":
+        return (), {}
+    exposures: dict[int, Exposure] = {}
+    entry: dict[str, Any] = {}
+    if len(images) > 1:
+        rng = rng_of(config.seed, Stream.BALANCED_POINTS)
+        fit = balance_config(config.fit)
+        cloud = setup.points, setup.point_colors
+        problem = FirstFrameProblem.of(views_of(setup, images), cloud, fit, config.render, rng)
+        balance = balance_cameras(problem, config.fit, config.seed, progress)
+        if balance.taken:
+            exposures = dict(zip(images, balance.exposures, strict=True))
+        entry["exposure"] = {
+            "sentence": balance.sentence,
+            "taken": balance.taken,
+            "recorded_psnr": balance.recorded_psnr,
+            "balanced_psnr": balance.balanced_psnr,
+        }
+    return tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras))), entry
+
+
+def corrected(images: Images, exposures: Sequence[Exposure]) -> dict[int, np.ndarray]:
+    """Return images, by view index, in the colours of the scene, by the exposures of all views in
+    the first frame; none: as they are.
+    """
+    return {v: exposures[v].corrected(image) if exposures else image for v, image in images.items()}
 
 
 def with_first_confidence(

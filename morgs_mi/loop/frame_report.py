@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from morgs_mi.codec.container import Packet
-from morgs_mi.loop.correction import Correction
 from morgs_mi.method.exposure import Exposure
 
 
@@ -55,12 +54,12 @@ class FrameReport:
 
 @dataclass(frozen=True)
 class FittedFrame:
-    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of
-    its images.
-    """
+    """Result of the fit of a frame: its packet, and entries of its `FrameReport`."""
 
     packet: Packet
-    correction: Correction
+    #: Exposures of all views in the first frame, relative to the scene; empty if they are not
+    #: estimated.
+    exposures: tuple[Exposure, ...]
     losses: dict[str, float]
     steps: int
     status: str

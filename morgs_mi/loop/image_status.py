@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import cv2
 import numpy as np
+
+from morgs_mi.method.exposure import thumbnail
 
 # px: thumbnails of this width keep the layout of a scene, without noise and the motion between two
 # frames.
@@ -35,10 +36,13 @@ def image_status(
             frame.
         images: of this frame, likewise.
     """
-    thumbnails = {v: _thumbnail(image) for v, image in images.items()}
-    plain = [v for v, image in thumbnails.items() if _is_plain(image)]
+    old_thumbnails, thumbnails = (
+        {v: thumbnail(image, _WIDTH).astype(np.float64) for v, image in some.items()}
+        for some in (previous, images)
+    )
+    plain = [v for v, image in thumbnails.items() if image.std((0, 1)).max() < _PLAIN]
     views = (v for v in thumbnails.keys() & previous.keys() if v not in plain)
-    cuts = [v for v in views if _is_cut(_thumbnail(previous[v]), thumbnails[v])]
+    cuts = [v for v in views if _is_cut(old_thumbnails[v], thumbnails[v])]
     sentences = []
     if plain:
         color = "black" if max(thumbnails[v].mean() for v in plain) < _BLACK else "of one colour"
@@ -63,21 +67,11 @@ def _list(names: Sequence[str], views: Sequence[int]) -> str:
     return ", ".join(names[v] or f"view {v}" for v in sorted(views))
 
 
-def _thumbnail(image: np.ndarray) -> np.ndarray:
-    """Return an image at a width of a few pixels [h, w, 3], in grey levels."""
-    height = max(1, round(_WIDTH * image.shape[0] / image.shape[1]))
-    return cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.float64)
-
-
-def _is_plain(thumbnail: np.ndarray) -> bool:
-    return bool(thumbnail.std((0, 1)).max() < _PLAIN)
-
-
 def _is_cut(a: np.ndarray, b: np.ndarray) -> bool:
     """Return whether two thumbnails show different scenes; another exposure, or light after black,
     is no cut.
     """
-    if _is_plain(a):
+    if a.std((0, 1)).max() < _PLAIN:
         return False
     a = a - a.mean((0, 1))
     b = b - b.mean((0, 1))

@@ -57,12 +57,30 @@ def copied_images(
             "push(): frame 0 must have an image of at least one view, got none; begin with one "
             "that has."
         )
-    views = enumerate(zip(cameras, images, strict=True))
-    copies = {
-        view: _copy(image, camera, f"push(): frame {frame} of view {camera.name or view!r}")
-        for view, (camera, image) in views
-        if image is not None
-    }
+    copies = {}
+    for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        if image is None:
+            continue
+        place = f"push(): frame {frame} of view {camera.name or view!r}"
+        array = as_array(image)
+        shape = (camera.height, camera.width, 3)
+        is_image = isinstance(array, np.ndarray) and array.shape == shape
+        if is_image and array.dtype == np.uint8:
+            copies[view] = array.copy()
+        elif is_image and array.dtype.kind == "f":
+            copies[view] = positive_light(array, place)
+            most = copies[view].max()
+            if most == 255 or (most > 2 and (copies[view] == np.rint(copies[view])).all()):
+                raise ValueError(
+                    f"{place} must be linear light with 1 for white where it is floats, got values "
+                    f"up to {most:g}, as integers have; pass uint8 in sRGB, or divide linear light "
+                    "by 255."
+                )
+        else:
+            raise ValueError(
+                f"{place} must be uint8 {list(shape)}, or linear light in floats, got "
+                f"{kind_of(array)}; convert it."
+            )
     kinds = {kind, *(image.dtype.name for image in copies.values())} - {""}
     if len(kinds) > 1:
         raise ValueError(
@@ -91,24 +109,3 @@ def in_order(cameras: Sequence[Camera], images: Any, frame: int) -> list[InputIm
             f"got {content}."
         )
     return list(images)
-
-
-def _copy(image: InputImage, camera: Camera, place: str) -> np.ndarray:
-    array = as_array(image)
-    shape = (camera.height, camera.width, 3)
-    is_image = isinstance(array, np.ndarray) and array.shape == shape
-    if is_image and array.dtype == np.uint8:
-        return array.copy()
-    if is_image and array.dtype.kind == "f":
-        light = positive_light(array, place)
-        most = light.max()
-        if most == 255 or (most > 2 and (light == np.rint(light)).all()):
-            raise ValueError(
-                f"{place} must be linear light with 1 for white where it is floats, got values up "
-                f"to {most:g}, as integers have; pass uint8 in sRGB, or divide linear light by 255."
-            )
-        return light
-    raise ValueError(
-        f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind_of(array)}; "
-        "convert it."
-    )

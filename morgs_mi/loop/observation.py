@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from morgs_mi.core.camera import OF_SENSOR, Camera
@@ -17,17 +18,16 @@ from morgs_mi.core.checks import check_mask, check_number, check_points, check_t
 from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
-from morgs_mi.fit.capacity import check_capacity
-from morgs_mi.fit.initialise import Points
+from morgs_mi.fit.budget import check_capacity
 from morgs_mi.fit.view import View
 from morgs_mi.loop.input_images import Frame, copied_images
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
+from morgs_mi.method.change import box_around, change_mask, moving_region
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
 from morgs_mi.method.flow import FlowObservation, observe_key_views
-from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
-from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
-from morgs_mi.method.motion_model import motion_model
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
+from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.objective import KeyView
 
 # Images of those views that have one, by view index.
@@ -117,11 +117,6 @@ class Setup:
     #: first frame determines it, see `display_stops`.
     display_exposure: float | None = None
 
-    @property
-    def cloud(self) -> Points:
-        """The points and their colours."""
-        return self.points, self.point_colors
-
 
 def prepare(
     cameras: Sequence[Camera],
@@ -141,11 +136,12 @@ def prepare(
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
     # An error now, not at the second frame, if a file that a method names is missing.
-    flow_source(config.motion.flow_method, config.motion.flow)
-    mask_refiner(config.motion.mask_method, config.motion.masks)
-    motion_model(config.motion)
+    motion = config.motion
+    FLOW_SOURCES.make(motion.flow_method, motion.flow)
+    MASK_REFINERS.make(motion.mask_method, motion.masks)
+    MOTION_MODELS.make(motion.model, motion)
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
-    key_views = choose_key_views(cameras, config.motion.key_views)
+    key_views = choose_key_views(cameras, motion.key_views)
     extent = scene_extent(cameras)
     if display_exposure is not None:
         check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
@@ -234,29 +230,21 @@ def _extended(
     images = {
         v: exposures[v].corrected(image) if v in exposures else image for v, image in images.items()
     }
-    changes = _changes(setup, history.references, images)
-    old = history.references
-    references = {
-        **old,
-        **{
-            v: update_reference(old[v], image, changes[v]) if v in old else image
-            for v, image in images.items()
-        },
-    }
-    return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
-
-
-def _changes(setup: Setup, references: Images, images: Images) -> dict[int, np.ndarray]:
-    """Return the masks of the pixels [H, W] that differ from the references, by view index; a
-    view's first image has no changes.
-    """
+    # A view's first image has no changes.
     changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}
-    views = sorted(images.keys() & references.keys())
+    references = {**history.references, **images}
+    views = sorted(images.keys() & history.references.keys())
     config = setup.config.motion.change
     masks = map_in_threads(
-        lambda v: change_mask(references[v], images[v], setup.masks[v], config), views
+        lambda v: change_mask(history.references[v], images[v], setup.masks[v], config), views
     )
-    return changes | dict(zip(views, masks, strict=True))
+    for v, mask in zip(views, masks, strict=True):
+        changes[v] = mask
+        # The reference is replaced where the image changed: a slow change is detected once it has
+        # added up.
+        old = history.references[v].copy()
+        references[v] = np.asarray(cv2.copyTo(images[v], mask.astype(np.uint8), old))
+    return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
 
 
 def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[int, Exposure]:
@@ -291,42 +279,21 @@ def _flows(
     with_masks = motion.learn_confidence and frame % motion.mask_interval == 0
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
         return {}, {}
-    pairs = _pairs(setup, frame, previous, images, changes)
+    common_views = sorted(previous.keys() & images.keys())
+    key_views = [v for v in setup.key_views if v in common_views]
+    if len(key_views) < len(setup.key_views) and common_views:  # others, where some lack an image
+        cameras = [setup.cameras[v] for v in common_views]
+        chosen = choose_key_views(cameras, len(setup.key_views))
+        key_views = [common_views[k] for k in chosen]
+    pairs = {}
+    for v in key_views:
+        box = None if changes is None else box_around(changes[v])
+        if changes is None or box is not None:
+            region = None if changes is None else moving_region(changes[v])
+            name = setup.cameras[v].name
+            pairs[v] = FramePair(images[v], previous[v], name, frame, setup.masks[v], box, region)
     if not pairs:
         return {}, {}
     masks = motion.mask_method if with_masks else None
     flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
     return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
-
-
-def _pairs(
-    setup: Setup,
-    frame: int,
-    previous: Images,
-    images: Images,
-    changes: Mapping[int, np.ndarray] | None,
-) -> dict[int, FramePair]:
-    """Return the key views that changed as pairs of the last image and this one, by view index."""
-    pairs = {}
-    for v in _frame_key_views(setup, previous, images):
-        box = None if changes is None else box_around(changes[v])
-        if changes is None or box is not None:
-            region = None if changes is None else moving_region(changes[v])
-            name = setup.cameras[v].name
-            valid = setup.masks[v]
-            pairs[v] = FramePair(images[v], previous[v], name, frame, valid, box, region)
-    return pairs
-
-
-def _frame_key_views(setup: Setup, previous: Images, images: Images) -> tuple[int, ...]:
-    """Return the key views of a frame: the key views of the setup, or others if some of them lack
-    an image.
-    """
-    common_views = sorted(previous.keys() & images.keys())
-    key_views = tuple(v for v in setup.key_views if v in common_views)
-    if len(key_views) == len(setup.key_views) or not common_views:
-        return key_views
-    return tuple(
-        common_views[k]
-        for k in choose_key_views([setup.cameras[v] for v in common_views], len(setup.key_views))
-    )

@@ -15,10 +15,11 @@ Gaussians are active: leaving out the others would cost more than it saves.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
+import cv2
 import mitsuba as mi
 import numpy as np
 from annotated_types import Ge
@@ -29,7 +30,6 @@ from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.change import connected_labels
 from morgs_mi.method.responsibility import ChangedView, overlap, responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.region import Region, summed_area
@@ -95,19 +95,13 @@ class ActiveSet:
         """
         if len(self.indices) == len(previous):
             return gaussians, source
-        static = self._static_indices(len(previous))
+        static = np.setdiff1d(np.arange(len(previous)), self.indices)
         index = np.where(source < 0, len(previous), self.indices[source])
         previous_index = np.concatenate([static, index])
         order = np.argsort(previous_index, kind="stable")  # births come last
         merged = Gaussians.concatenate([at_rest(previous.select(static)), gaussians])
         merged_source = np.where(previous_index < len(previous), previous_index, -1)
         return merged.select(order), merged_source[order]
-
-    def _static_indices(self, count: int) -> np.ndarray:
-        """Return the indices of the others among `count` Gaussians, ascending."""
-        is_static = np.ones(count, bool)
-        is_static[self.indices] = False
-        return np.flatnonzero(is_static)
 
     @property
     def fractions(self) -> dict[str, float]:
@@ -133,7 +127,7 @@ def full_active_set(
 def find_active_set(
     gaussians: Gaussians,
     cameras: Mapping[int, Camera],
-    changes: Mapping[int, np.ndarray],
+    changes: Mapping[int, np.ndarray] | None,
     channels: Mapping[int, Sequence[str]],
     render: RenderConfig,
     config: ActiveSetConfig | None = None,
@@ -143,13 +137,14 @@ def find_active_set(
     Args:
         gaussians: N Gaussians of the previous frame, detached.
         cameras: V cameras, by view index.
-        changes: masks of their changed pixels, bool [H, W], by view index.
+        changes: masks of their changed pixels, bool [H, W], by view index; None: all may have
+            changed.
         channels: channels that will be rendered, by view index.
         render: cut-offs.
         config: settings.
     """
     config = config or ActiveSetConfig()
-    if sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
+    if changes is None or sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
         return full_active_set(gaussians, cameras, render)
     changed_views = {
         v: ChangedView(
@@ -158,8 +153,21 @@ def find_active_set(
         for v, camera in cameras.items()
     }
     shares = responsibility(gaussians, changed_views.values(), config.min_weight)
-    active = _active(gaussians, shares, changed_views.values(), config)
-    blocks_by_view = _drawn(active, shares > QUIET, changed_views, config)
+    active = shares > config.min_responsibility
+    active &= overlap(len(gaussians), changed_views.values()) > _MIN_OVERLAP
+    if gaussians.logit_confidence is not None:
+        active |= np.asarray(gaussians.logit_confidence) > 0
+    for view in changed_views.values():
+        active |= _inside_unexplained(view, active)
+    # Those that hardly change are drawn in some views only.
+    indices = list(cameras)
+    quiet_views = choose_key_views(list(cameras.values()), config.quiet_views)
+    some = {indices[k] for k in quiet_views}
+    drawn = {v: active if v in some else active & (shares > QUIET) for v in cameras}
+    blocks_by_view = {
+        v: view.boxes.union(drawn[v], view.view.grid) | (view.counts > 0)
+        for v, view in changed_views.items()
+    }
     static = at_rest(gaussians.select(~active))
     views = {
         v: make_active_view(
@@ -171,70 +179,25 @@ def find_active_set(
     return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras))
 
 
-def _active(
-    gaussians: Gaussians,
-    shares: np.ndarray,
-    views: Collection[ChangedView],
-    config: ActiveSetConfig,
-) -> np.ndarray:
-    """Return the active Gaussians by their responsibilities [N], bool [N]."""
-    active = (shares > config.min_responsibility) & (overlap(len(gaussians), views) > _MIN_OVERLAP)
-    if gaussians.logit_confidence is not None:
-        active |= np.asarray(gaussians.logit_confidence) > 0
-    for view in views:
-        active |= _inside_unexplained(view, active)
-    return active
-
-
-def _drawn(
-    active: np.ndarray,
-    changing: np.ndarray,
-    views: Mapping[int, ChangedView],
-    config: ActiveSetConfig,
-) -> dict[int, np.ndarray]:
-    """Return the drawn blocks [rows, columns], by view index: changes, and boxes of active
-    Gaussians [N].
-    """
-    indices = list(views)
-    cameras = [entry.view.camera for entry in views.values()]
-    some = {indices[k] for k in choose_key_views(cameras, config.quiet_views)}
-    selections = {v: active if v in some else active & changing for v in views}
-    return {
-        v: entry.boxes.union(selections[v], entry.view.grid) | (entry.counts > 0)
-        for v, entry in views.items()
-    }
-
-
 def _inside_unexplained(changed_view: ChangedView, active: np.ndarray) -> np.ndarray:
-    """Return the Gaussians that lie by more than half in changes that active ones do not explain,
-    bool [N].
+    """Return the Gaussians that lie by more than half in connected changes of which active ones
+    cover less than half, bool [N].
     """
     grid = changed_view.view.grid
     boxes = changed_view.boxes
-    unexplained = _unexplained(changed_view.counts, boxes.union(active, grid), grid.block)
-    if not unexplained.any():
-        return np.zeros_like(active)
-    table = from_numpy(mi.UInt32, summed_area(unexplained))
-    return np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
-
-
-def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:
-    """Return the blocks of the connected changes that others cover by less than half, bool
-    [rows, columns].
-
-    Args:
-        counts: changed pixels of each block.
-        covered: blocks that active Gaussians cover.
-        block: width and height of a block in pixels.
-    """
-    changes = counts > _CHANGED * block[0] * block[1]
+    counts = changed_view.counts
+    changes = counts > _CHANGED * grid.block[0] * grid.block[1]
+    covered = changes & boxes.union(active, grid)
     if not (changes & ~covered).any():
-        return np.zeros_like(changes)
-    labels, count = connected_labels(changes)
+        return np.zeros_like(active)
+    count, labels = cv2.connectedComponents(changes.astype(np.uint8))
     area, covered_area = (
-        np.bincount(labels[blocks], counts[blocks], count)
-        for blocks in (changes, changes & covered)
+        np.bincount(labels[blocks], counts[blocks], count) for blocks in (changes, covered)
     )
     missing = covered_area < EXPLAINED * area
     missing[0] = False
-    return missing[labels]
+    labels = np.asarray(labels, np.int32)
+    if not missing.any():
+        return np.zeros_like(active)
+    table = from_numpy(mi.UInt32, summed_area(missing[labels]))
+    return np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)

@@ -71,30 +71,18 @@ class Boxes:
         )
         some = (x1 > x0) & (y1 > y0)
         width, height = grid.block
-        low = (x0[some] // width, y0[some] // height)
-        high = (-(-x1[some] // width), -(-y1[some] // height))
-        return _covered(low, high, grid.shape)
-
-
-def _covered(
-    low: tuple[np.ndarray, np.ndarray], high: tuple[np.ndarray, np.ndarray], shape: tuple[int, int]
-) -> np.ndarray:
-    """Return the cells of a grid that any rectangle covers, bool [rows, columns].
-
-    Args:
-        low: first column and first row of each rectangle.
-        high: column and row after the last ones.
-        shape: rows and columns of the grid.
-    """
-    x0, y0 = low
-    x1, y1 = high
-    rows, columns = (size + 1 for size in shape)
-    corners = np.concatenate(
-        [y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0]
-    )
-    signs = np.repeat([1.0, -1.0], 2 * len(x0))
-    steps = np.bincount(corners, signs, rows * columns).reshape(rows, columns)
-    return (steps.cumsum(0).cumsum(1) > 0.5)[:-1, :-1]
+        x0 = x0[some] // width
+        y0 = y0[some] // height
+        x1 = -(-x1[some] // width)
+        y1 = -(-y1[some] // height)
+        # Summed over rows and columns, steps at the four corners fill a rectangle.
+        rows, columns = (size + 1 for size in grid.shape)
+        corners = np.concatenate(
+            [y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0]
+        )
+        signs = np.repeat([1.0, -1.0], 2 * len(x0))
+        steps = np.bincount(corners, signs, rows * columns).reshape(rows, columns)
+        return (steps.cumsum(0).cumsum(1) > 0.5)[:-1, :-1]
 
 
 def boxes_around(gaussians: Gaussians, camera: Camera, render: RenderConfig, core: float) -> Boxes:

@@ -73,28 +73,26 @@ def change_mask(
     """
     config = config or ChangeConfig()
     H, W = reference.shape[:2]
-    difference, unit = _difference(reference, image)
+    if reference.dtype == np.uint8 and image.dtype == np.uint8:  # large images: in integers
+        difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)
+        unit = _GREY_LEVEL
+    else:
+        difference = np.subtract(image, reference, dtype=np.float32)
+        unit = 1.0
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
-    for channel in cv2.split(cv2.transform(_half_sized(difference), unit * _COLORS)):
+    half_size = (max(W // 2, 1), max(H // 2, 1))
+    half = cv2.resize(difference, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
         color_levels = _levels(channel, 2, config)
         pixel_levels = cv2.resize(color_levels, (W, H), interpolation=cv2.INTER_NEAREST)
         levels = np.maximum(levels, pixel_levels)
-    return _with_peaks(levels if valid is None else levels * valid)
-
-
-def _half_sized(image: np.ndarray) -> np.ndarray:
-    """Return an image at half the resolution, float32."""
-    size = (max(image.shape[1] // 2, 1), max(image.shape[0] // 2, 1))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-
-
-def _difference(reference: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the difference of two images, and its unit. It is in integers where they are: large
-    images.
-    """
-    if reference.dtype == np.uint8 and image.dtype == np.uint8:
-        return cv2.subtract(image, reference, dtype=cv2.CV_16S), _GREY_LEVEL
-    return np.subtract(image, reference, dtype=np.float32), 1.0
+    levels = levels if valid is None else levels * valid
+    # The connected changes that have a peak.
+    count, labels = cv2.connectedComponents((levels > 0).astype(np.uint8))
+    has_peak = np.zeros(count, bool)
+    labels = np.asarray(labels, np.int32)
+    has_peak[labels[levels > 1]] = True
+    return has_peak[labels]
 
 
 def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
@@ -109,34 +107,14 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     window = max(_WINDOW // scale, 1) | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
-    everywhere = min(_noise(average), _GREY_LEVEL)
+    sample = average.ravel()[:: max(1, average.size // 20_000)]
+    deviation = float(np.median(np.abs(sample - np.median(sample))))
+    everywhere = min(_NORMAL * deviation, _GREY_LEVEL)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
     threshold = np.maximum(config.sigmas * noise, _GREY_LEVEL).astype(np.float32)
     size = np.abs(average)
     exceeds = size > cv2.resize(threshold, change.shape[::-1])
     return exceeds * np.where(size > config.min_peak, np.uint8(2), np.uint8(1))
-
-
-def _noise(average: np.ndarray) -> float:
-    """Return the standard deviation of the noise of an averaged change, from a sample of it."""
-    sample = average.ravel()[:: max(1, average.size // 20_000)]
-    return _NORMAL * float(np.median(np.abs(sample - np.median(sample))))
-
-
-def _with_peaks(levels: np.ndarray) -> np.ndarray:
-    """Return the connected changes that have a peak, bool [H, W]; `levels` as from `_levels`."""
-    labels, count = connected_labels(levels > 0)
-    has_peak = np.zeros(count, bool)
-    has_peak[labels[levels > 1]] = True
-    return has_peak[labels]
-
-
-def connected_labels(mask: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the number of each pixel's connected part of a mask [H, W], int32, 0 outside the mask,
-    and how many numbers there are.
-    """
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
-    return np.asarray(labels, np.int32), count
 
 
 def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
@@ -167,20 +145,6 @@ def moving_region(change: np.ndarray) -> np.ndarray:
     return (closing != 2)[margin:-margin, margin:-margin]
 
 
-def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the image that the next frame is compared with: the reference, replaced where the
-    image changed.
-
-    So a slow change is detected once it has added up.
-
-    Args:
-        reference: [H, W, 3].
-        image: of the same camera [H, W, 3].
-        change: the `change_mask` of both [H, W].
-    """
-    return np.asarray(cv2.copyTo(image, change.astype(np.uint8), reference.copy()))
-
-
 def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
     """Return rows and columns of the smallest box around a mask [H, W], enlarged by half its size
     on all sides.
@@ -190,13 +154,11 @@ def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
     """
     if not mask.any():
         return None
-    return _span(np.any(mask, axis=1)), _span(np.any(mask, axis=0))
-
-
-def _span(line: np.ndarray) -> slice:
-    """Return the range from the first to the last set place of a line, with its margin."""
-    (places,) = np.nonzero(line)
-    low = int(places[0])
-    high = int(places[-1]) + 1
-    margin = max(_MARGIN, (high - low) // 2)
-    return slice(max(low - margin, 0), min(high + margin, len(line)))
+    spans = []
+    for line in (np.any(mask, axis=1), np.any(mask, axis=0)):
+        (places,) = np.nonzero(line)
+        low = int(places[0])
+        high = int(places[-1]) + 1
+        margin = max(_MARGIN, (high - low) // 2)
+        spans.append(slice(max(low - margin, 0), min(high + margin, len(line))))
+    return spans[0], spans[1]

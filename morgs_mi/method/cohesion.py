@@ -21,10 +21,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.neighbours import NeighbourIndex
 
 # Of 1: the chromaticity of darker colours is noise.
 _LEAST_COLOR = 0.02
@@ -35,6 +35,39 @@ _CHROMA_SCALE = 0.03
 # Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads
 # farther.
 ROUNDS = 150
+
+
+class NeighbourIndex:
+    """Nearest neighbours among N points.
+
+    Args:
+        points: [N, 3].
+    """
+
+    def __init__(self, points: np.ndarray) -> None:
+        self._points = np.asarray(points)
+        self._tree = KDTree(self._points)
+        self._of_all: dict[int, np.ndarray] = {}
+
+    def nearest(self, count: int, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the indices of the nearest other points, the nearest first.
+
+        Args:
+            count: number of neighbours of each point.
+            rows: int [M], the points that they are neighbours of; None: all N.
+
+        Returns:
+            int [M, min(count, N - 1)].
+        """
+        if rows is None and count in self._of_all:
+            return self._of_all[count]
+        points = self._points if rows is None else self._points[rows]
+        k = min(count, len(self._points) - 1) + 1
+        # The first is the point itself.
+        near = np.asarray(self._tree.query(points, k, workers=-1)[1]).reshape(len(points), k)[:, 1:]
+        if rows is None:
+            self._of_all[count] = near
+        return near
 
 
 def share_confidence(
@@ -56,10 +89,15 @@ def share_confidence(
         neighbours: index of all means; None: it is built.
     """
     neighbours = neighbours or NeighbourIndex(np.asarray(gaussians.means))
-    near = neighbours.nearest_of(indices, _NEIGHBOURS)
+    near = neighbours.nearest(_NEIGHBOURS, indices)
     if not near.size:
         return logit
-    affinity = weight * _affinity(gaussians, indices, near)
+    # Colours without view-dependence, each divided by its sum.
+    color = np.maximum(0.5 + SH_C0 * np.asarray(gaussians.sh_coeffs)[:, 0], _LEAST_COLOR)
+    chroma = color / color.sum(axis=1, keepdims=True)
+    square = np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2)
+    likeness = np.asarray(gaussians.opacities)[near] * np.exp(-square / (2 * _CHROMA_SCALE**2))
+    affinity = weight * likeness.astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])
     weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(indices), len(gaussians)))
     total = 1 + affinity.sum(axis=1)
@@ -68,17 +106,3 @@ def share_confidence(
     for _ in range(ROUNDS):
         everywhere[indices] = (logit + weights @ everywhere) / total
     return everywhere[indices]
-
-
-def _affinity(gaussians: Gaussians, indices: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the affinities [M, k] of the Gaussians at `indices` [M] to neighbours [M, k]."""
-    chroma = _chromaticity(gaussians)
-    opacity = np.asarray(gaussians.opacities)
-    square = np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2)
-    return (opacity[near] * np.exp(-square / (2 * _CHROMA_SCALE**2))).astype(np.float32)
-
-
-def _chromaticity(gaussians: Gaussians) -> np.ndarray:
-    """Return the colours [N, 3] without view-dependence, each divided by its sum."""
-    color = np.maximum(0.5 + SH_C0 * np.asarray(gaussians.sh_coeffs)[:, 0], _LEAST_COLOR)
-    return color / color.sum(axis=1, keepdims=True)

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
-from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 
 # px, the width of an image that `MaskConfig.floor` refers to.
 _FLOOR_WIDTH = 1352
@@ -57,22 +56,9 @@ def flow_mask(
         motion: [H, W, 2] in pixels, of either sign.
         reliable: [H, W] bool; unreliable pixels are not in the mask.
         config: settings of the threshold; None: the defaults.
-
-    Raises:
-        ValueError: `motion` is not [H, W, 2] or `reliable` has another size.
     """
-    _check_shapes(motion, reliable)
     moving = np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)
     return moving if reliable is None else moving & reliable
-
-
-def _check_shapes(motion: np.ndarray, reliable: np.ndarray | None) -> None:
-    if motion.ndim != 3 or motion.shape[2] != 2:
-        raise ValueError(f"flow_mask(): `motion` must be [H, W, 2], got {motion.shape}.")
-    if reliable is not None and reliable.shape != motion.shape[:2]:
-        raise ValueError(
-            f"flow_mask(): `reliable` must be {motion.shape[:2]}, got {reliable.shape}."
-        )
 
 
 def motion_mask(
@@ -88,10 +74,10 @@ def motion_mask(
         image: frame t [H, W, 3], RGB, uint8 or float in [0, 1].
         motion: [H, W, 2] in pixels on frame t's grid.
         reliable: [H, W] bool, see `consistency_mask`.
-        method: as for `mask_refiner`.
+        method: an entry of `MASK_REFINERS`.
         config: settings of the flow mask and its refinement; None: the defaults.
 
     Raises:
-        ValueError: as `flow_mask`, `mask_refiner` and the refiner.
+        ValueError: the method is not registered, or as the refiner.
     """
-    return mask_refiner(method, config)(image, flow_mask(motion, reliable, config))
+    return MASK_REFINERS.make(method, config)(image, flow_mask(motion, reliable, config))

@@ -70,14 +70,11 @@ class Exposure:
         """
         if self == Exposure():
             return image
+        gain, bias = np.array((self.gain, self.bias))
         if image.dtype != np.uint8:
-            return _bent(self.inverse(_straightened(image))).astype(np.float32)
-        table = 255 * self.inverse(np.arange(256)[:, None] / 255)
+            return _bent((_straightened(image) - bias) / gain).astype(np.float32)
+        table = 255 * ((np.arange(256)[:, None] / 255 - bias) / gain)
         return cv2.LUT(image, np.clip(np.rint(table), 0, 255).astype(np.uint8)[None])
-
-    def inverse(self, colors: np.ndarray) -> np.ndarray:
-        """Return the colours [..., 3] of the scene that the camera shows as these."""
-        return (colors - np.array(self.bias)) / np.array(self.gain)
 
     def after(self, first: Exposure) -> Exposure:
         """Return the exposure that acts as `first` and then this one."""
@@ -116,8 +113,9 @@ def fit_exposure(
         images that do not show the same.
     """
     prior = prior or Exposure()
-    good = (_is_well_exposed(recorded) & _is_well_exposed(scene)).all(axis=-1)
-    good = good if mask is None else good & mask
+    good = np.ones(scene.shape[:-1], bool) if mask is None else mask
+    for values in (recorded, scene):
+        good = good & ((values > _DARK) & (values < _BRIGHT)).all(axis=-1)
     if good.sum() < _MIN_PIXELS:
         return prior
     channels = zip(
@@ -130,11 +128,6 @@ def fit_exposure(
     gains, biases = zip(*(_line(x, y, line, weights) for x, y, *line in channels), strict=True)
     plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
     return _exposure(np.array(gains), np.array(biases)) if plausible else prior
-
-
-def _is_well_exposed(values: np.ndarray) -> np.ndarray:
-    """Return the mask of values that are neither nearly black nor nearly white."""
-    return (values > _DARK) & (values < _BRIGHT)
 
 
 def _line(
@@ -154,14 +147,10 @@ def _line(
         change = np.linalg.solve((rows * counts) @ rows.T + regular, (rows * counts) @ rest)
         if np.abs(change - last).max() < _CONVERGED:
             break
-        counts = _robust_weights(rest - change @ rows)
+        errors = rest - change @ rows
+        scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
+        counts = (1 + (errors / scale) ** 2) ** -2.0  # small for outliers
     return float(prior[0] + change[0]), float(prior[1] + change[1] + _TOE * change[0])
-
-
-def _robust_weights(errors: np.ndarray) -> np.ndarray:
-    """Return the weights of errors [P], which are small for outliers."""
-    scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
-    return (1 + (errors / scale) ** 2) ** -2.0
 
 
 def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
@@ -190,13 +179,9 @@ def common_change(exposures: Sequence[Exposure]) -> Exposure:
         return Exposure()
     lines = np.array([(e.gain, e.bias) for e in exposures])
     middle = _exposure(*np.median(lines, axis=0))
-    spread = float(np.median([_tone_difference(e, middle) for e in exposures]))
+    middle_tones = middle(_TONES)
+    spread = float(np.median([np.abs(e(_TONES) - middle_tones).max() for e in exposures]))
     return middle if spread < 0.5 * middle.change else Exposure()
-
-
-def _tone_difference(a: Exposure, b: Exposure) -> float:
-    """Return the largest difference of a dark, middle or bright tone, of 1."""
-    return np.abs(a(_TONES) - b(_TONES)).max()
 
 
 def follow_exposure(
@@ -214,16 +199,16 @@ def follow_exposure(
         last: exposure of the last frame, the prior; None: the reference's exposure.
     """
     small_reference, small_image = (
-        _thumbnail(x.astype(np.float32) / 255) for x in (reference, image)
+        thumbnail(x.astype(np.float32) / 255, _WIDTH) for x in (reference, image)
     )
-    small_mask = None if mask is None else _thumbnail(mask.astype(np.float32)) > 0.99
+    small_mask = None if mask is None else thumbnail(mask.astype(np.float32), _WIDTH) > 0.99
     return fit_exposure(small_reference, small_image, small_mask, last)
 
 
-def _thumbnail(image: np.ndarray) -> np.ndarray:
-    """Return an image, no wider than `_WIDTH`."""
+def thumbnail(image: np.ndarray, most: int) -> np.ndarray:
+    """Return an image, no wider than `most` pixels."""
     height, width = image.shape[:2]
-    size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
+    size = (min(width, most), max(1, round(height * min(1, most / width))))
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 

@@ -7,14 +7,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FlowSource, FramePair, flow_source
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.flow_sources.flow_registry import (
+    FLOW_SOURCES,
+    FlowConfig,
+    FlowSource,
+    FramePair,
+)
+from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +46,16 @@ def observe_key_views(
 
     Args:
         pairs: images of the key views at two frames, by view index.
-        method: source of the flow, see `flow_source`.
-        mask_method: refinement of the masks, see `mask_refiner`; None: no masks.
+        method: source of the flow, see `FLOW_SOURCES`.
+        mask_method: refinement of the masks, see `MASK_REFINERS`; None: no masks.
         flow: settings of the flow and of its check.
         masks: settings of the masks.
 
     Raises:
         OSError: flow is read from files and one is missing.
-        ValueError: as `flow_source` and `mask_refiner`.
+        ValueError: a method is not registered, or as its factory.
     """
-    source = flow_source(method, flow)
+    source = FLOW_SOURCES.make(method, flow)
     flows = map_in_threads(lambda pair: _checked_flow(source, pair, flow), pairs.values())
     observations = dict(zip(pairs, flows, strict=True))
     if not mask_method:
@@ -68,7 +72,14 @@ def _checked_flow(
 ) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
     backward, forward = source(pair)
-    reliable, forward_reliable = _reliable(pair, backward, forward, config)
+    valid = pair.valid
+    if pair.box is not None:
+        valid = np.zeros(backward.shape[:2], bool)
+        valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
+    reliable, forward_reliable = (
+        consistency_mask(flow, back, config) & (True if valid is None else valid)
+        for flow, back in ((backward, forward), (forward, backward))
+    )
     if pair.region is not None:
         # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
         backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
@@ -78,23 +89,31 @@ def _checked_flow(
     return FlowObservation(-backward, reliable, forward, forward_reliable)
 
 
-def _reliable(
-    pair: FramePair, backward: np.ndarray, forward: np.ndarray, config: FlowConfig | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the backward flow and where the forward flow is reliable, bool [H, W] each."""
-    reliable, forward_reliable = (
-        consistency_mask(*flows, config) for flows in ((backward, forward), (forward, backward))
+def consistency_mask(
+    flow: np.ndarray, back: np.ndarray, config: FlowConfig | None = None
+) -> np.ndarray:
+    """Return the mask of reliable flow [H, W], bool: pixels that the flow back returns to where
+    they started.
+
+    |F + B|^2 < 0.01 (|F|^2 + |B|^2) + 0.5 px^2, with B sampled at x + F(x) (Sundaram, Brox and
+    Keutzer, ECCV 2010). Pixels that become hidden or leave the image fail.
+
+    Args:
+        flow: F [H, W, 2] in pixels, from one frame to another.
+        back: B [H, W, 2], from the other frame to the first, on the other frame's grid.
+        config: the two tolerances; None: the defaults above.
+    """
+    config = config or FlowConfig()
+    height, width = flow.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    x = x + flow[..., 0]
+    y = y + flow[..., 1]
+    back = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    mismatch, forth, opposite = (
+        np.einsum("hwc,hwc->hw", vectors, vectors) for vectors in (flow + back, flow, back)
     )
-    valid = _valid_in_box(pair, reliable.shape)
-    if valid is None:
-        return reliable, forward_reliable
-    return reliable & valid, forward_reliable & valid
-
-
-def _valid_in_box(pair: FramePair, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return the valid pixels inside the box of a pair, bool [H, W]; None if all are."""
-    if pair.box is None:
-        return pair.valid
-    valid = np.zeros(shape, bool)
-    valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
-    return valid
+    limit = config.consistency_relative * (forth + opposite) + config.consistency_absolute
+    # An image ends half a pixel beyond the outermost centres, so the flow's own error does not
+    # reject the border.
+    is_within = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
+    return is_within & (mismatch < limit)

@@ -30,18 +30,17 @@ noise of the flow in some view.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.view_group import ViewGroup
@@ -112,30 +111,29 @@ def lift_flow(
         N = len(gaussians)
         logit = np.full(N, -MAX_LOGIT, np.float32)
         return MotionStart(np.zeros((N, 3), np.float32), logit)
-    key_views = [views[v] for v in indices]
-    cameras = [view.camera for view in key_views]
-    sums = _flow_sums(gaussians, key_views, [observations[v] for v in indices])
+    group = ViewGroup([views[v] for v in indices])
+    flow = group.crop([observations[v].forward_flow for v in indices])
+    reliable = group.crop([observations[v].forward_reliable for v in indices])
+    # u, |u|^2 and 1 where the flow u is reliable; 0 elsewhere.
+    maps = np.empty((*reliable.shape, _FLOW_MAPS), np.float32)
+    maps[..., :2] = flow
+    maps[..., 2] = np.sum(flow**2, axis=-1)
+    maps[..., 3] = 1
+    maps *= reliable[..., None]
+    view_sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
     means = gaussians.numpy()["means"].astype(np.float64)
-    view_motions = [
-        _lift_view(view_sums, means, camera, motion_floor(camera.width, masks))
-        for view_sums, camera in zip(sums, cameras, strict=True)
-    ]
+    view_motions = []
+    for sums, view in zip(view_sums, group.views, strict=True):
+        average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
+        variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
+        jacobian = view.camera.projection_jacobian(means)
+        floor = motion_floor(view.camera.width, masks)
+        view_motions.append(_LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor))
     d = _robust_displacement(view_motions, len(means))
     logit = _logits(view_motions, d)
     return MotionStart(
         np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
     )
-
-
-def _flow_sums(
-    gaussians: Gaussians, views: Sequence[ActiveView], observations: Sequence[FlowObservation]
-) -> np.ndarray:
-    """Return the sums of `_flow_maps` over the pixels of each Gaussian, [V, N, 4]."""
-    group = ViewGroup(views)
-    flow = group.crop([observation.forward_flow for observation in observations])
-    reliable = group.crop([observation.forward_reliable for observation in observations])
-    maps = from_numpy(mi.Float, _flow_maps(flow, reliable))
-    return group.draw(gaussians).sums(maps, _FLOW_MAPS).astype(float)
 
 
 def _robust_displacement(views: list[_LiftView], N: int) -> np.ndarray:
@@ -147,43 +145,20 @@ def _robust_displacement(views: list[_LiftView], N: int) -> np.ndarray:
 
 
 def _logits(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
-    """Return the logits [N] of the confidence that Gaussians move by d [N, 3]."""
-    logit = _CONFIDENCE_SLOPE * (_evidence(views, d) - _MIN_EVIDENCE)
-    return np.where(_moves(views, d), np.clip(logit, -MAX_LOGIT, MAX_LOGIT), -MAX_LOGIT)
-
-
-def _moves(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
-    """Return the mask [N] of motions d [N, 3] above the floor in some view."""
-    return np.any([np.linalg.norm(view.project(d), axis=1) > view.floor for view in views], axis=0)
-
-
-def _evidence(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
-    """Return e [N], by which motions d [N, 3] explain the flow better than no motion does."""
+    """Return the logits [N] of the confidence that Gaussians move by d [N, 3]: from the evidence e,
+    by which d explains the flow better than no motion does.
+    """
     gain = np.zeros(len(d))
     total = np.full(len(d), 1e-6)
+    is_visible = np.zeros(len(d), bool)
     for view in views:
         motion = view.project(d)
         a = view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
         gain += a * (view.cost(np.zeros_like(d), motion) - view.cost(d, motion))
         total += a
-    return gain / total
-
-
-def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
-    """Return u, |u|^2 and 1 [..., 4] where the flow u [..., 2] is reliable [...]; 0 elsewhere."""
-    maps = np.empty((*reliable.shape, _FLOW_MAPS), np.float32)
-    maps[..., :2] = flow
-    maps[..., 2] = np.sum(flow**2, axis=-1)
-    maps[..., 3] = 1
-    return maps * reliable[..., None]
-
-
-def _lift_view(sums: np.ndarray, means: np.ndarray, camera: Camera, floor: float) -> _LiftView:
-    """Return the flow of a view at every Gaussian, from the sums of `_flow_maps` [N, 4]."""
-    average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
-    variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
-    jacobian = camera.projection_jacobian(means)
-    return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor)
+        is_visible |= np.linalg.norm(motion, axis=1) > view.floor
+    logit = _CONFIDENCE_SLOPE * (gain / total - _MIN_EVIDENCE)
+    return np.where(is_visible, np.clip(logit, -MAX_LOGIT, MAX_LOGIT), -MAX_LOGIT)
 
 
 def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:
@@ -195,10 +170,7 @@ def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:
         weight = k * view.weight
         system = system + weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
         right = right + np.einsum("nij,ni->nj", J, weight[:, None] * view.flow)
-    return np.linalg.solve(system + _prior(views) * np.eye(3), np.asarray(right)[..., None])[..., 0]
-
-
-def _prior(views: list[_LiftView]) -> float:
-    """Return lambda, which has the unit of J' J."""
+    # lambda, which has the unit of J' J.
     scales = [np.median(np.sum(view.jacobian[:, 0] ** 2, axis=1)) for view in views]
-    return max(_PRIOR_PIXELS * float(np.mean(scales)), 1e-30)
+    prior = max(_PRIOR_PIXELS * float(np.mean(scales)), 1e-30)
+    return np.linalg.solve(system + prior * np.eye(3), np.asarray(right)[..., None])[..., 0]

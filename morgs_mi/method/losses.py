@@ -6,14 +6,11 @@ Every loss is a mean over pixels or Gaussians. Its weight does not depend on the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import mitsuba as mi
 
-from morgs_mi.core.checks import check_number, check_type
-from morgs_mi.core.types import Float, Tensor
-from morgs_mi.method.ssim import OnRegion, Target, WholeView
+from morgs_mi.core.types import Tensor
+from morgs_mi.method.ssim import Recon, Target
 from morgs_mi.render.region import Region
 
 
@@ -31,23 +28,9 @@ def recon_loss(
         region: the only pixels that are compared; the target itself surrounds them. The derivative
             equals the whole view's. The value omits pixels outside the region and SSIM windows
             without pixels inside, because they cannot have changed.
-
-    Raises:
-        ValueError: image and target differ in size.
     """
-    check_type("recon_loss()", "target", target, Target)
-    check_number("recon_loss()", "dssim_weight", dssim_weight, "[0, 1]")
-    _check_shape(
-        "recon_loss()", "image", image, target.shape if region is None else region.shape(3)
-    )
-    if region is None or region.whole:
-        return dr.custom(WholeView, image.array, target, dssim_weight)
-    if (region.height, region.width) != target.shape[:2]:
-        raise ValueError(
-            f"recon_loss(): `region` must be of a {target.shape[1]}x{target.shape[0]} view like "
-            f"its target, got {region.width}x{region.height}."
-        )
-    return dr.custom(OnRegion, image.array, target, dssim_weight, region)
+    part = None if region is None or region.whole else region
+    return dr.custom(Recon, image.array, target, dssim_weight, part)
 
 
 def flow_loss(
@@ -63,10 +46,6 @@ def flow_loss(
             pixels weigh little.
         num_pixels: of the whole view; None: those given.
     """
-    pixels = _shape_of(motion)[:-1]
-    _check_shape("flow_loss()", "motion", motion, (*pixels, 2))
-    _check_shape("flow_loss()", "target", target, (*pixels, 2))
-    _check_shape("flow_loss()", "reliable", reliable, pixels)
     lane = dr.arange(mi.UInt32, dr.width(motion) // 2) * 2
     x, y = (
         dr.gather(mi.Float, motion.array, lane + k, mode=dr.ReduceMode.NoConflicts)
@@ -74,17 +53,16 @@ def flow_loss(
         for k in range(2)
     )
     # A hundredth of a pixel keeps the derivative finite where both agree.
-    return _mean(dr.sqrt(x * x + y * y + 1e-4) * reliable.array, num_pixels)
+    total = dr.sum(dr.sqrt(x * x + y * y + 1e-4) * reliable.array)
+    return total * dr.opaque(mi.Float, 1 / (num_pixels or dr.width(reliable)))
 
 
 def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int | None = None) -> Tensor:
     """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W]
     (eq. 11), as `flow_loss`.
     """
-    pixels = _shape_of(confidence)[:-1]
-    _check_shape("mask_loss()", "confidence", confidence, (*pixels, 1))
-    _check_shape("mask_loss()", "mask", mask, pixels)
-    return _mean(dr.abs(confidence.array - mask.array), num_pixels)
+    total = dr.sum(dr.abs(confidence.array - mask.array))
+    return total * dr.opaque(mi.Float, 1 / (num_pixels or dr.width(mask)))
 
 
 def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None) -> Tensor:
@@ -95,27 +73,6 @@ def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None)
         extent: of the scene, world units.
         num_gaussians: of the whole scene; None: those given.
     """
-    check_number("offset_loss()", "extent", extent, "(0, inf)")
-    _check_shape("offset_loss()", "offset", offset, (*_shape_of(offset)[:1], 3))
     return dr.sum(dr.abs(offset.array)) * dr.opaque(
         mi.Float, 1 / ((num_gaussians or int(offset.shape[0])) * extent)
     )
-
-
-def _shape_of(tensor: Tensor) -> tuple[int, ...]:
-    """Return the shape of a tensor, or () for any other value, which `_check_shape` refuses."""
-    return tuple(getattr(tensor, "shape", ()))
-
-
-def _check_shape(place: str, name: str, tensor: Tensor, shape: Sequence[int]) -> None:
-    """Raise an error unless a tensor has a shape and no size is 0."""
-    check_type(place, name, tensor, mi.TensorXf)
-    if tuple(tensor.shape) != tuple(shape) or 0 in shape:
-        raise ValueError(
-            f"{place}: `{name}` must be {list(shape)} with sizes above 0, got "
-            f"{list(tensor.shape)}; render and observe the same pixels."
-        )
-
-
-def _mean(values: Float, count: int | None) -> Tensor:
-    return dr.sum(values) * dr.opaque(mi.Float, 1 / (count or dr.width(values)))

@@ -17,16 +17,20 @@ class Registry(Generic[Made, Config]):
     the implementation.
 
     Args:
-        place: the public function that looks names up, for error messages.
+        place: the class with the setting, for error messages.
         setting: the setting that holds the string, for error messages.
+        config: class of the config, which `make` builds where it gets none.
     """
 
-    def __init__(self, place: str, setting: str) -> None:
+    def __init__(self, place: str, setting: str, config: Callable[[], Config]) -> None:
         self._place = place
         self._setting = setting
-        self._factories: dict[str, Callable[[str, Config], Made]] = {}
-        self._arguments: dict[str, str] = {}
-        self._cached = lru_cache(maxsize=8)(self._make)
+        self._config = config
+        self._entries: dict[str, tuple[str, Callable[[str, Config], Made]]] = {}
+        # The last few implementations: a network is loaded once.
+        self._make = lru_cache(maxsize=8)(
+            lambda name, argument, config: self._entries[name][1](argument, config)
+        )
 
     def register(
         self, name: str, argument: str = ""
@@ -41,54 +45,50 @@ class Registry(Generic[Made, Config]):
         Raises:
             ValueError: the name is empty, has a colon or is taken.
         """
-        if not name or ":" in name or name in self._factories:
+        if not name or ":" in name or name in self._entries:
+            problem = "is registered already" if name in self._entries else "is no name"
             raise ValueError(
-                f"register(): `name` must be a new name without a colon, got {name!r}; rename one."
+                f"register(): `name` must be a new name without a colon, got {name!r}, which "
+                f"{problem}; rename one."
             )
 
         def add(factory: Callable[[str, Config], Made]) -> Callable[[str, Config], Made]:
-            self._factories[name] = factory
-            self._arguments[name] = argument
+            self._entries[name] = argument, factory
             return factory
 
         return add
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The names that take no argument, in the order of their registration."""
+        return tuple(name for name, (argument, _) in self._entries.items() if not argument)
+
+    @property
     def usages(self) -> tuple[str, ...]:
         """Values of the setting: names without an argument, then NAME:ARGUMENT of the others."""
-        usages = [f"{name}:{argument}" for name, argument in self._arguments.items()]
-        return tuple(
-            usage.removesuffix(":") for usage in sorted(usages, key=lambda usage: usage[-1] != ":")
-        )
+        others = (f"{name}:{text}" for name, (text, _) in self._entries.items() if text)
+        return (*self.names, *others)
 
-    def make(self, text: str, config: Config) -> Made:
-        """Return the implementation that `text` selects; the last few are cached, so a network is
-        loaded once.
+    def make(self, text: str, config: Config | None = None) -> Made:
+        """Return the implementation that `text` selects; None: with the defaults.
 
         Raises:
             ValueError: `text` selects none, or as its factory.
         """
         self.check(text)
-        return self._cached(text, config)
-
-    def _make(self, text: str, config: Config) -> Made:
         name, _, argument = text.partition(":")
-        return self._factories[name](argument, config)
+        return self._make(name, argument, self._config() if config is None else config)
 
-    def check(self, text: str, place: str = "") -> None:
+    def check(self, text: str) -> None:
         """Raise an error unless `text` selects an implementation, which is not made.
-
-        Args:
-            text: value of the setting.
-            place: where the error's sentence begins; by default the function that looks names up.
 
         Raises:
             ValueError: it selects none.
         """
         name, colon, argument = text.partition(":")
-        takes_argument = bool(self._arguments.get(name))
-        if name not in self._factories or not (takes_argument == bool(colon) == bool(argument)):
+        placeholder, _ = self._entries.get(name, (None, None))
+        if placeholder is None or not (bool(placeholder) == bool(colon) == bool(argument)):
             usages = ", ".join(self.usages) or "the registered names, of which there are none"
             raise ValueError(
-                f"{place or self._place}: `{self._setting}` must be one of {usages}, got {text!r}."
+                f"{self._place}: `{self._setting}` must be one of {usages}, got {text!r}."
             )

@@ -10,10 +10,8 @@ from annotated_types import Ge, Le
 from morgs_mi.core.config import config_class
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
 
@@ -86,6 +84,6 @@ class MotionConfig:
     """Detection of changed pixels."""
 
     def __post_init__(self) -> None:
-        FLOW_SOURCES.check(self.flow_method, "MotionConfig()")
-        MASK_REFINERS.check(self.mask_method, "MotionConfig()")
-        MOTION_MODELS.check(self.model, "MotionConfig()")
+        FLOW_SOURCES.check(self.flow_method)
+        MASK_REFINERS.check(self.mask_method)
+        MOTION_MODELS.check(self.model)

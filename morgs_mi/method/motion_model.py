@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,9 +29,6 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
 from morgs_mi.method.method_registry import Registry
-
-if TYPE_CHECKING:
-    from morgs_mi.method.motion_config import MotionConfig
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,23 +48,11 @@ class MotionModel:
 # model.
 MotionModelFactory = Callable[[Gaussians, float, np.random.Generator], MotionModel]
 
-MOTION_MODELS: Registry[MotionModelFactory | None, MotionConfig] = Registry(
-    "motion_model()", "model"
+MOTION_MODELS: Registry[MotionModelFactory | None, Any] = Registry(
+    "MotionConfig()", "model", lambda: None
 )
-
-
-@MOTION_MODELS.register("none")
-def _none(argument: str, config: MotionConfig) -> None:
-    return None
-
-
-def motion_model(config: MotionConfig) -> MotionModelFactory | None:
-    """Return the factory of the motion model that the setting `model` selects; None for `none`.
-
-    Raises:
-        ValueError: no model of this name is registered.
-    """
-    return MOTION_MODELS.make(config.model, config)
+"""Models by name; ``none`` is None. Their factories get the `MotionConfig`."""
+MOTION_MODELS.register("none")(lambda argument, config: None)
 
 
 def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gaussians:

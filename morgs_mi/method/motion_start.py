@@ -11,8 +11,8 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.method.boxes import boxes_around
+from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import MAPS, KeyImages
 from morgs_mi.render.active_view import ActiveView
@@ -83,17 +83,12 @@ class MotionProblem:
         """
         some = self.gaussians.select(np.flatnonzero(selection))
         places = [some, *(displaced(some, d[selection]) for d in displacements if d.any())]
-        narrow_views = {
-            index: view.narrowed(_blocks_around(view, places)) for index, view in self.views.items()
-        }
-        views = {index: view for index, view in narrow_views.items() if view is not None}
+        views = {}
+        for index, view in self.views.items():
+            boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
+            every = np.ones(len(some), bool)
+            blocks = np.any([box.union(every, view.grid) for box in boxes], axis=0)
+            narrow_view = view.narrowed(blocks)
+            if narrow_view is not None:
+                views[index] = narrow_view
         return KeyImages(views, self.targets) if views else None
-
-
-def _blocks_around(view: ActiveView, places: Sequence[Gaussians]) -> np.ndarray:
-    """Return the blocks of a view that Gaussians reach in any of some places, bool
-    [rows, columns].
-    """
-    boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-    all_rows = np.ones(len(places[0]), bool)
-    return np.any([box.union(all_rows, view.grid) for box in boxes], axis=0)

@@ -64,18 +64,13 @@ class ObjectiveConfig:
 
     def __post_init__(self) -> None:
         for text in self.terms:
-            LOSS_TERMS.check(text, "ObjectiveConfig()")
+            LOSS_TERMS.check(text)
             _weight(text.partition(":")[2])
         names = [text.partition(":")[0] for text in self.terms]
         if len(names) > len({*names}):
             raise ValueError(
                 f"ObjectiveConfig(): `terms` must name each term once, got {self.terms}."
             )
-
-    @property
-    def is_rigid(self) -> bool:
-        """Whether a term compares neighbours."""
-        return max(self.rigid_weight, self.rotation_weight, self.isometry_weight) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,24 +113,6 @@ class Term:
     observer: Observer | None = None
 
 
-def _observe_motion(
-    view: KeyView, motion: MotionConfig, config: ObjectiveConfig
-) -> dict[str, np.ndarray]:
-    """Return the motion by optical flow [H, W, 2] in px, and where it is reliable [H, W]."""
-    return (
-        {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
-    )
-
-
-def _observe_mask(
-    view: KeyView, motion: MotionConfig, config: ObjectiveConfig
-) -> dict[str, np.ndarray]:
-    """Return the motion mask [H, W], in frames that have one."""
-    return (
-        {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
-    )
-
-
 TERMS: tuple[Term, ...] = (
     Term(  # eq. 2
         "recon",
@@ -152,7 +129,11 @@ TERMS: tuple[Term, ...] = (
         ),
         channels=("guided_motion",),
         observations=("motion", "reliable"),
-        observer=_observe_motion,
+        observer=lambda view, motion, config: (
+            {"motion": view.flow.motion, "reliable": view.flow.reliable}
+            if motion.learn_motion
+            else {}
+        ),
     ),
     Term(  # eq. 11
         "mask",
@@ -160,7 +141,11 @@ TERMS: tuple[Term, ...] = (
         lambda p, o, config: mask_loss(p.image.confidence, o["mask"], p.num_pixels),
         channels=("confidence",),
         observations=("mask",),
-        observer=_observe_mask,
+        observer=lambda view, motion, config: (
+            {"mask": view.flow.mask}
+            if motion.learn_confidence and view.flow.mask is not None
+            else {}
+        ),
     ),
     Term(  # L_off
         "offset",
@@ -184,7 +169,9 @@ TERMS: tuple[Term, ...] = (
 )
 
 
-LOSS_TERMS: Registry[Term, ObjectiveConfig] = Registry("ObjectiveConfig()", "terms")
+LOSS_TERMS: Registry[Term, ObjectiveConfig] = Registry(
+    "ObjectiveConfig()", "terms", ObjectiveConfig
+)
 
 
 def loss_term(
@@ -241,7 +228,7 @@ def _weight(text: str) -> float:
     return weight
 
 
-def _terms_of(config: ObjectiveConfig) -> tuple[Term, ...]:
+def terms_of(config: ObjectiveConfig) -> tuple[Term, ...]:
     """Return all terms that the settings have a weight for."""
     return (*TERMS, *(LOSS_TERMS.make(text, config) for text in config.terms))
 
@@ -250,24 +237,28 @@ def observe(
     views: Mapping[int, KeyView], motion: MotionConfig, config: ObjectiveConfig
 ) -> dict[int, dict[str, np.ndarray]]:
     """Return the observations of the key views, arrays [H, W, ...] by name, by view index."""
-    observations: dict[int, dict[str, np.ndarray]] = {}
-    for index, view in views.items():
-        observers = (term.observer for term in _terms_of(config) if term.observer)
-        arrays = (observer(view, motion, config) for observer in observers)
-        observations[index] = {name: array for by_name in arrays for name, array in by_name.items()}
-    return observations
+    observers = [term.observer for term in terms_of(config) if term.observer]
+    return {
+        index: {
+            name: array
+            for observer in observers
+            for name, array in observer(view, motion, config).items()
+        }
+        for index, view in views.items()
+    }
 
 
 def active_terms(
     observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig
 ) -> list[Term]:
     """Return the terms that act in a view with these observations."""
-
-    def acts(term: Term) -> bool:
-        has_observations = all(name in observations for name in term.observations)
-        return has_observations and all(name in parameters for name in term.parameters)
-
-    return [term for term in _terms_of(config) if term.weight(config) and acts(term)]
+    return [
+        term
+        for term in terms_of(config)
+        if term.weight(config)
+        and observations.keys() >= {*term.observations}
+        and all(name in parameters for name in term.parameters)
+    ]
 
 
 def channels_of(observations: Observations, config: ObjectiveConfig) -> tuple[str, ...]:
@@ -286,4 +277,4 @@ def losses_of(
 
 def weights_of(config: ObjectiveConfig) -> dict[str, float]:
     """Return the weights of the terms, by name."""
-    return {term.name: term.weight(config) for term in _terms_of(config)}
+    return {term.name: term.weight(config) for term in terms_of(config)}

@@ -60,32 +60,21 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
     if not moves.any():
         return replace(start, color_change=_color_change(start_sums["color"], start_sums["weight"]))
     near = problem.neighbours.nearest(_NEIGHBOURS)
-    step = np.where(moves[:, None], _step(_jacobians(problem, d), start_sums, near, moves), 0)
-    return _stepped(problem, start, start_sums, step.astype(np.float32))
-
-
-def _stepped(
-    problem: MotionProblem, start: MotionStart, sums: Mapping[str, np.ndarray], step: np.ndarray
-) -> MotionStart:
-    """Return a start after the steps [N, 3] that lower the error; `sums` are those without them."""
-    d = start.displacement
+    places = np.asarray(problem.gaussians.means) + d
+    cameras = [view.camera for view in problem.views.values()]
+    jacobians = np.stack([camera.projection_jacobian(places) for camera in cameras])
+    step = np.where(moves[:, None], _step(jacobians, start_sums, near, moves), 0).astype(np.float32)
     step_sums = problem.images.sums(
         displaced(problem.gaussians, d + step), ("error", "weight", "color")
     )
-    better = relative_error(step_sums) < relative_error(sums)
-    color = np.where(better[:, None], step_sums["color"], sums["color"])
-    weight = np.where(better, step_sums["weight"], sums["weight"])
+    better = relative_error(step_sums) < relative_error(start_sums)
+    color = np.where(better[:, None], step_sums["color"], start_sums["color"])
+    weight = np.where(better, step_sums["weight"], start_sums["weight"])
     return replace(
         start,
         displacement=(d + np.where(better[:, None], step, 0)).astype(np.float32),
         color_change=_color_change(color, weight),
     )
-
-
-def _jacobians(problem: MotionProblem, d: np.ndarray) -> np.ndarray:
-    """Return J [V, N, 2, 3] in all views at the means displaced by d [N, 3]."""
-    places = np.asarray(problem.gaussians.means) + d
-    return np.stack([view.camera.projection_jacobian(places) for view in problem.views.values()])
 
 
 def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -99,7 +88,7 @@ def _step(
     jacobians: np.ndarray, sums: Mapping[str, np.ndarray], near: np.ndarray, moves: np.ndarray
 ) -> np.ndarray:
     """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums G [V, N, 3] (xx, xy, yy) and b
-    [V, N, 2].
+    [V, N, 2], shortened to `LONGEST_PX` in the view where it is longest.
     """
     G = sums["normal"][..., [0, 1, 1, 2]].reshape(*sums["normal"].shape[:2], 2, 2)
     system = np.einsum("vnia,vnij,vnjb->nab", jacobians, G, jacobians, optimize=True)
@@ -107,16 +96,8 @@ def _step(
     counts = moves[near].astype(float)
     system = system + np.einsum("nk,nkab->nab", counts, system[near])
     right = right + np.einsum("nk,nka->na", counts, right[near])
-    step = np.linalg.solve(system + _prior(jacobians) * np.eye(3), right[..., None])[..., 0]
-    return _bounded(step, jacobians)
-
-
-def _prior(jacobians: np.ndarray) -> float:
-    """Return lambda, which has the unit of J' J; `jacobians` are [V, N, 2, 3]."""
-    return max(_PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1)), 1e-30)
-
-
-def _bounded(step: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """Return steps [N, 3], shortened to `LONGEST_PX` in the view where they are longest."""
+    # lambda, which has the unit of J' J.
+    prior = max(_PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1)), 1e-30)
+    step = np.linalg.solve(system + prior * np.eye(3), right[..., None])[..., 0]
     length = np.linalg.norm(np.einsum("vnij,nj->vni", jacobians, step), axis=-1).max(axis=0)
     return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]

@@ -4,7 +4,7 @@ Flow fails where parts are thin and fast, or look alike. But motion mostly conti
 share it. So each Gaussian gets further proposals, as pixels do in PatchMatch (Barnes et al. 2009):
 first its own motion of the previous frame, then, in each round, the motion of a random one of its
 nearest moving neighbours. All Gaussians try their proposals at once and are rendered in the key
-views. With the attributed error E_iv and the coverage W_iv there (see `method.attribution`), the
+views. With the attributed error E_iv and the coverage W_iv there (see `error_per_gaussian`), the
 error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
@@ -19,7 +19,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.sweep import KeyImages, relative_error
+from morgs_mi.method.sweep import relative_error
 
 # Rounds of proposals from neighbours, after the one from the previous frame.
 _ROUNDS = 2
@@ -42,62 +42,39 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         start: by lifted flow.
     """
     d = start.displacement  # [N, 3]
+    logit = start.logit_confidence
     last_motion = _previous_motion(problem.gaussians)
     if not problem.views or not (d.any() or last_motion.any()):
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
-    moving = np.any([d, last_motion], axis=(0, 2))
-    images = problem.images_around(_reached(near, moving, _rounds(near)), (d, last_motion))
-    return start if images is None else _propagated(problem, start, images, near)
-
-
-def _rounds(near: np.ndarray) -> int:
-    """Return the number of rounds of proposals from neighbours `near` [N, k]."""
-    return _ROUNDS if near.size else 0
-
-
-def _propagated(
-    problem: MotionProblem, start: MotionStart, images: KeyImages, near: np.ndarray
-) -> MotionStart:
-    """Return a start with the proposals that lower the error in `images`."""
-    d = start.displacement
-    logit = start.logit_confidence
-    error = _error_of(problem, images, d)
-    for k in range(1 + _rounds(near)):
-        proposal = (
-            d[_moving_neighbour(near, d, problem.rng)]
-            if k
-            else _continued(d, _previous_motion(problem.gaussians))
-        )
+    rounds = _ROUNDS if near.size else 0
+    reached = np.asarray(d.any(axis=1) | last_motion.any(axis=1))
+    for _ in range(rounds):  # those that may move within these rounds
+        reached = np.logical_or(reached, reached[near].any(axis=1))
+    images = problem.images_around(reached, (d, last_motion))
+    if images is None:
+        return start
+    names = ("error", "weight")
+    error = relative_error(images.sums(displaced(problem.gaussians, d), names))
+    for k in range(1 + rounds):
+        moves = np.asarray(d.any(axis=1))
+        if k:
+            # A random neighbour of each Gaussian, a moving one if there is any.
+            draw = moves[near] + problem.rng.random(near.shape, np.float32)
+            proposal = d[near[np.arange(len(near)), draw.argmax(axis=1)]]
+        else:
+            proposal = np.where(np.any(last_motion, axis=1, keepdims=True), last_motion, d)
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue
-        new_error = _error_of(problem, images, proposal)
-        is_better = differs & (new_error < _error_ratio(d) * error)
+        new_error = relative_error(images.sums(displaced(problem.gaussians, proposal), names))
+        ratio = np.where(moves, _ERROR_RATIO, _ERROR_RATIO_STATIC)
+        is_better = differs & (new_error < ratio * error)
         d = np.where(is_better[:, None], proposal, d)
         error = np.where(is_better, new_error, error)
-        logit = np.where(is_better, _accepted_logit(logit, d), logit)
+        accepted = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
+        logit = np.where(is_better, accepted, logit)
     return MotionStart(d, logit.astype(np.float32))
-
-
-def _error_of(problem: MotionProblem, images: KeyImages, d: np.ndarray) -> np.ndarray:
-    """Return the errors [N] of Gaussians displaced by d [N, 3]."""
-    return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
-
-
-def _continued(d: np.ndarray, last_motion: np.ndarray) -> np.ndarray:
-    """Return the motions [N, 3] into the previous frame, and d for Gaussians that did not move."""
-    return np.where(np.any(last_motion, axis=1, keepdims=True), last_motion, d)
-
-
-def _error_ratio(d: np.ndarray) -> np.ndarray:
-    """Return the ratio [N] of errors up to which Gaussians with motions d [N, 3] accept others."""
-    return np.where(d.any(axis=1), _ERROR_RATIO, _ERROR_RATIO_STATIC)
-
-
-def _accepted_logit(logit: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return the logits [N] of the confidence of Gaussians that accepted motions d [N, 3]."""
-    return np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
 
 
 def _previous_motion(gaussians: Gaussians) -> np.ndarray:
@@ -110,16 +87,3 @@ def _previous_motion(gaussians: Gaussians) -> np.ndarray:
     if gaussians.logit_confidence is None:
         return motion
     return np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, motion, 0)
-
-
-def _reached(near: np.ndarray, moving: np.ndarray, rounds: int) -> np.ndarray:
-    """Return which Gaussians a motion can reach within some rounds, bool [N]."""
-    for _ in range(rounds):
-        moving = moving | moving[near].any(axis=1)
-    return moving
-
-
-def _moving_neighbour(near: np.ndarray, d: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the index of a random neighbour of each Gaussian [N], a moving one if there is any."""
-    draw = np.any(d, axis=1)[near] + rng.random(near.shape, np.float32)
-    return near[np.arange(len(near)), draw.argmax(axis=1)]

@@ -44,10 +44,19 @@ def residual_parameters(
     Raises:
         ValueError: the confidence is learned, and the Gaussians have none.
     """
-    parameters = _zero_parameters(previous, config)
+    shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
+    names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
+    parameters = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
     gate: np.ndarray | float = 1.0
     if config.learn_confidence:
-        logit = _start_logit(previous, config, start)
+        logit = previous.logit_confidence
+        if logit is None:
+            raise ValueError(
+                "residual_parameters(): `previous` must have a confidence with "
+                "`learn_confidence`, got none; set `logit_confidence`, or switch the module off."
+            )
+        if start is not None and config.lift_confidence:
+            logit = from_numpy(mi.TensorXf, start.logit_confidence)
         # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
         gate = np.maximum(np.asarray(sigmoid(logit.array)), _MIN_GATE)[:, None]
         parameters["logit_confidence"] = logit
@@ -59,25 +68,6 @@ def residual_parameters(
     if start.color_change is not None:
         parameters["sh_dc"] = from_numpy(mi.TensorXf, start.color_change[:, None])
     return parameters
-
-
-def _zero_parameters(previous: Gaussians, config: MotionConfig) -> dict[str, Tensor]:
-    """Return the parameters of a residual that changes nothing, without a confidence."""
-    shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
-    names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
-    return {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
-
-
-def _start_logit(previous: Gaussians, config: MotionConfig, start: MotionStart | None) -> Tensor:
-    """Return the logits [N] of the confidence at the start: lifted ones, or as before."""
-    if previous.logit_confidence is None:
-        raise ValueError(
-            "residual_parameters(): `previous` must have a confidence with "
-            "`learn_confidence`, got none; set `logit_confidence`, or switch the module off."
-        )
-    if start is not None and config.lift_confidence:
-        return from_numpy(mi.TensorXf, start.logit_confidence)
-    return previous.logit_confidence
 
 
 def apply_residual(

@@ -24,10 +24,9 @@ overlap is the mean over these views,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import cv2
 import drjit as dr
@@ -71,54 +70,38 @@ def responsibility(
     """
     near = dr.zeros(mi.Float, len(gaussians))
     area = dr.zeros(mi.Float, len(gaussians))
-    reduced_views = list[_ReducedView]()
+    views_with_changes = []
+    shares = []
+    factors = []
     for changed_view in views:
         boxes = changed_view.boxes
         area += boxes.area
-        if changed_view.change.any():
-            view = _reduced_view(changed_view, width)
-            reduced_views.append(view)
-            near += boxes.within(view.region.block_table, view.region.grid, view.factor)
-    if not reduced_views:
+        if not changed_view.change.any():
+            continue
+        view = changed_view.view
+        factor = max(view.camera.width // width, 1)
+        h, w = (max(size // factor, 1) for size in changed_view.change.shape)
+        change = changed_view.change.astype(np.float32)
+        share = cv2.resize(change, (w, h), interpolation=cv2.INTER_AREA)
+        region = Region(share > 0, view.config)
+        near += boxes.within(region.block_table, region.grid, factor)
+        views_with_changes.append(ActiveView(view.camera.resized(w, h), view.config, region))
+        shares.append(share)
+        factors.append(factor)
+    if not factors:
         return np.zeros(len(gaussians), np.float32)
-    change_weight, weight = _weights(gaussians, reduced_views)
+    # Blend weights summed over changed pixels, and over all in their blocks, in px of the view.
+    group = ViewGroup(views_with_changes)
+    blocks = [region.num_blocks for region in group.regions]
+    pixel_area = np.repeat(np.square(factors), blocks)[:, None, None]
+    share = group.crop(shares)
+    maps = np.stack([pixel_area * share, np.broadcast_to(pixel_area, share.shape)], axis=-1)
+    change_weight, weight = group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
     visible = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
     # view.
     area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
     return np.where(visible, change_weight / np.where(visible, weight * area_ratio, 1), 0)
-
-
-class _ReducedView(NamedTuple):
-    """A view with changes at a fraction of its resolution."""
-
-    view: ActiveView  # the blocks with changes
-    region: Region  # these blocks
-    share: np.ndarray  # changed share of each reduced pixel [h, w]
-    factor: int  # by which the view is reduced
-
-
-def _reduced_view(changed_view: ChangedView, width: int) -> _ReducedView:
-    """Return a view reduced by the largest whole factor that leaves a width, in px."""
-    view = changed_view.view
-    factor = max(view.camera.width // width, 1)
-    share = _reduced(changed_view.change, factor)
-    region = Region(share > 0, view.config)
-    camera = view.camera.resized(*share.shape[::-1])
-    return _ReducedView(ActiveView(camera, view.config, region), region, share, factor)
-
-
-def _weights(gaussians: Gaussians, views: Sequence[_ReducedView]) -> np.ndarray:
-    """Return the blend weights [2, N] summed over changed pixels, and over all in their blocks, in
-    px of the whole views.
-    """
-    group = ViewGroup([view.view for view in views])
-    change = group.crop([view.share for view in views])
-    blocks = [region.num_blocks for region in group.regions]
-    # px of the view per reduced pixel.
-    area = np.repeat(np.square([view.factor for view in views]), blocks)[:, None, None]
-    maps = np.stack([area * change, np.broadcast_to(area, change.shape)], axis=-1)
-    return group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
 
 
 def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
@@ -136,11 +119,3 @@ def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
                 changed_view.boxes.within(table, changed_view.view.grid)
             ) / np.maximum(area, 1)
     return shares / np.maximum(counts, 1)
-
-
-def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:
-    """Return the covered share of the pixels of a mask [H, W] at 1 / factor of its resolution,
-    float32.
-    """
-    height, width = (max(size // factor, 1) for size in mask.shape)
-    return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)

@@ -23,8 +23,8 @@ from scipy.sparse import csr_array
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Jit, Tensor
+from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.motion_model import quaternion_product, sparse_product
-from morgs_mi.method.neighbours import NeighbourIndex
 
 # Scene extents below which a length counts as 0: the derivative of a norm is infinite there.
 _SHORT = 1e-6

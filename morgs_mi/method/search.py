@@ -29,10 +29,9 @@ from scipy.sparse.csgraph import connected_components
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.config import config_class
-from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.core.gaussians import displaced
+from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.neighbours import NeighbourIndex
-from morgs_mi.render.view_group import ViewGroup
 
 _GRID = 16  # steps of the grid from 0 to its end, in each direction of each axis
 # Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above
@@ -79,28 +78,31 @@ def search_motion(
         return start
     displacement = start.displacement
     logit = start.logit_confidence
+    gaussians = problem.gaussians
     parts = _unexplained_parts(problem, displacement, config.max_parts)
-    for part, d in _find(problem, parts, config.reach):
+    surfaces = [
+        part_surfaces
+        for first in range(0, len(parts), 3)
+        for part_surfaces in _cost_surfaces(problem, parts[first : first + 3], config.reach)
+    ]
+    for part, part_surfaces in zip(parts, surfaces, strict=True):
+        center = np.asarray(gaussians.means)[part].mean(axis=0)
+        d = _best_displacement(center, part_surfaces, config.reach)
+        if not d.any():
+            continue
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
-        if _is_better(problem, part, displacement, proposal):
+        images = problem.images_around(part, [displacement, proposal])
+        if images is None:
+            continue
+        old_error, new_error = (
+            images.total_error(displaced(gaussians, at)) for at in (displacement, proposal)
+        )
+        if new_error < _ERROR_RATIO * old_error:
             displacement = proposal
             logit = np.where(part, np.maximum(logit, _LOGIT), logit)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
-
-
-def _is_better(
-    problem: MotionProblem, part: np.ndarray, displacement: np.ndarray, proposal: np.ndarray
-) -> bool:
-    """Return whether another displacement [N, 3] of a part clearly lowers the error around it."""
-    images = problem.images_around(part, [displacement, proposal])
-    if images is None:
-        return False
-    old_error, new_error = (
-        images.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal)
-    )
-    return new_error < _ERROR_RATIO * old_error
 
 
 def _unexplained_parts(
@@ -110,92 +112,91 @@ def _unexplained_parts(
     mask [N].
     """
     sums = problem.sums_at(displacement)
-    error = sums["error"].sum(0)
-    unexplained = _unexplained(error, sums["weight"].sum(0))
+    total_error = sums["error"].sum(0)
+    weight = sums["weight"].sum(0)
+    error = total_error / (weight + 1)
+    visible = weight > 1
+    if not visible.any():
+        return []
+    typical = max(float(np.median(error[visible])), 1 / 255)
+    unexplained = visible & (error > _UNEXPLAINED * typical)
     if np.count_nonzero(unexplained) < _MIN_SIZE:
         return []
     near = NeighbourIndex(np.asarray(problem.gaussians.means) + displacement).nearest(_NEIGHBOURS)
-    label = _connected(near, unexplained)
-    size = np.bincount(label, unexplained)
-    total = np.bincount(label, np.where(unexplained, error, 0))
-    largest = np.argsort(-total, kind="stable")[:count]
-    return [label == part for part in largest if size[part] >= _MIN_SIZE]
-
-
-def _unexplained(error_sums: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the visible Gaussians with large errors, bool [N], from the sums of errors and of
-    weights.
-    """
-    error = error_sums / (weight + 1)
-    visible = weight > 1
-    if not visible.any():
-        return visible
-    return visible & (error > _UNEXPLAINED * max(float(np.median(error[visible])), 1 / 255))
-
-
-def _connected(near: np.ndarray, unexplained: np.ndarray) -> np.ndarray:
-    """Return a number [N] that unexplained neighbours have in common; `near` [N, k] are indices."""
     ends = unexplained[:, None] & unexplained[near]
     rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
-    return connected_components(graph, directed=False)[1]
-
-
-def _find(
-    problem: MotionProblem, parts: Sequence[np.ndarray], reach: float
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the parts that are found elsewhere, each with its displacement [3]."""
-    centers = np.asarray(problem.gaussians.means)
-    displaced_parts = []
-    for first in range(0, len(parts), 3):
-        few = parts[first : first + 3]
-        for part, surfaces in zip(few, _cost_surfaces(problem, few, reach), strict=True):
-            d = _best_displacement(centers[part].mean(axis=0), surfaces, reach)
-            if d.any():
-                displaced_parts.append((part, d))
-    return displaced_parts
+    label = connected_components(graph, directed=False)[1]
+    size = np.bincount(label, unexplained)
+    total = np.bincount(label, np.where(unexplained, total_error, 0))
+    largest = np.argsort(-total, kind="stable")[:count]
+    return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
 
 def _cost_surfaces(
     problem: MotionProblem, parts: Sequence[np.ndarray], reach: float
 ) -> list[list[_CostSurface]]:
     """Return the cost surfaces of each of up to three parts, in the views that show it."""
+    surfaces: list[list[_CostSurface]] = [[] for _ in parts]
     images = problem.images_around(np.any(parts, axis=0), [])
     if images is None:
-        return [[] for _ in parts]
-    factor = _reduction(images.group, reach)
-    previous = problem.gaussians
-    colors, brighter_colors = (
-        images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, parts))
-    )
-    views = [
-        _MatchedView(view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor)
-        for (v, view), color in zip(images.views.items(), colors, strict=True)
-    ]
-    # The weight of a part is the increase of a pixel if the part is brighter by 1.
-    weights = [
-        np.clip(brighter - color, 0, 1)
-        for color, brighter in zip(colors, brighter_colors, strict=True)
-    ]
-    return [
-        _part_surfaces(views, [weight[..., k] for weight in weights]) for k in range(len(parts))
-    ]
-
-
-def _part_surfaces(
-    views: Sequence[_MatchedView], weights: Sequence[np.ndarray]
-) -> list[_CostSurface]:
-    """Return the cost surfaces of a part in the views in which a weight [h, w] is not 0."""
-    pairs = zip(views, weights, strict=True)
-    return [view.cost_surface(weight) for view, weight in pairs if weight.any()]
-
-
-def _brighter(gaussians: Gaussians, parts: Sequence[np.ndarray]) -> Gaussians:
-    """Return Gaussians with the red, green or blue of up to three parts increased by 1."""
-    sh_coeffs = np.array(gaussians.sh_coeffs)
+        return surfaces
+    widest = max(view.camera.width for view in images.views.values())
+    factor = _reduction(widest, images.group.region.block, reach)
+    # The weight of a part is the increase of a pixel if the part is brighter by 1: in red, green or
+    # blue.
+    sh_coeffs = np.array(problem.gaussians.sh_coeffs)
     for k, part in enumerate(parts):
         sh_coeffs[part, 0, k] += 1 / np.float32(SH_C0)
-    return replace(gaussians, sh_coeffs=sh_coeffs)
+    colors = images.rendered(problem.gaussians, factor)
+    brighter_colors = images.rendered(replace(problem.gaussians, sh_coeffs=sh_coeffs), factor)
+    for (v, view), color, brighter in zip(
+        images.views.items(), colors, brighter_colors, strict=True
+    ):
+        target = problem.targets[v].image()
+        height = target.shape[0] // factor
+        width = target.shape[1] // factor
+        target = target[: height * factor, : width * factor]
+        if factor > 1:
+            target = cv2.resize(target, (width, height), interpolation=cv2.INTER_AREA)
+        weights = np.clip(brighter - color, 0, 1)
+        for k in range(len(parts)):
+            if weights[..., k].any():
+                cost = _matching_cost(target, color, weights[..., k]) * factor**2
+                surfaces[k].append(_CostSurface(cost, view.camera, 1 / factor))
+    return surfaces
+
+
+def _reduction(width: int, block: tuple[int, int], reach: float) -> int:
+    """Return the factor by which images are reduced: it divides the sides of a block, and leaves 2
+    px per step of the grid, if any does.
+    """
+    side = gcd(*block)
+    return next(
+        f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * width and side % f == 0)
+    )
+
+
+def _matching_cost(target: np.ndarray, rendering: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the inner sums of C(d) for all shifts up to a margin, along y and x in pixels.
+
+    Args:
+        target: the target [h, w, 3].
+        rendering: rendering of the previous Gaussians [h, w, 3].
+        weight: m of a part [h, w], not all 0.
+    """
+    rows, columns = np.nonzero(weight > 0.01 * weight.max())
+    box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    # Twice the grid along an axis, as its corners are farther; beyond its border, the image is
+    # continued.
+    margin = 4 * _GRID
+    wide = cv2.copyMakeBorder(target, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+    surroundings = wide[
+        rows.min() : rows.max() + 1 + 2 * margin, columns.min() : columns.max() + 1 + 2 * margin
+    ]
+    mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
+    cost = cv2.matchTemplate(surroundings, rendering[box], cv2.TM_SQDIFF, mask=mask)
+    return np.maximum(cost, 0)
 
 
 def _best_displacement(
@@ -206,26 +207,20 @@ def _best_displacement(
     """
     if not surfaces:
         return np.zeros(3)
-
-    def cost_of(d: np.ndarray) -> np.ndarray:
-        return np.sum([surface.at(center, d) for surface in surfaces], axis=0)
-
     camera = surfaces[0].camera
     px_per_unit = np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
     unit = reach * camera.width / _GRID / px_per_unit
-    d = np.zeros(3)
-    for grid in _grids():
-        steps = d + unit * grid
-        d = steps[np.argmin(cost_of(steps))]
-    at_d, at_rest = cost_of(np.stack([d, np.zeros(3)]))
-    return d if at_d < _COST_RATIO * at_rest else np.zeros(3)
-
-
-def _grids() -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps [K, 3] of the whole grid, and quarters of steps around its middle."""
+    # The whole grid, then quarters of steps around its best.
     axes = [np.arange(-_GRID, _GRID + 1)] * 3
     coarse = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return coarse, coarse[np.abs(coarse).max(axis=1) <= 4] / 4
+    fine = coarse[np.abs(coarse).max(axis=1) <= 4] / 4
+    d = np.zeros(3)
+    for grid in (coarse, fine):
+        steps = d + unit * grid
+        d = steps[np.argmin(np.sum([surface.at(center, steps) for surface in surfaces], axis=0))]
+    ends = np.stack([d, np.zeros(3)])
+    at_d, at_rest = np.sum([surface.at(center, ends) for surface in surfaces], axis=0)
+    return d if at_d < _COST_RATIO * at_rest else np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,59 +236,3 @@ class _CostSurface:
         pixels, _ = self.camera.project(np.concatenate([center[None], center + d]))
         shift = (pixels[1:] - pixels[0]) * self.scale + len(self.cost) // 2
         return map_coordinates(self.cost, shift[:, ::-1].T, order=1, mode="nearest")
-
-
-@dataclass(frozen=True, eq=False)
-class _MatchedView:
-    """A view in which parts are looked for, with images reduced to 2 px or more per step of the
-    grid.
-    """
-
-    camera: Camera  # the view
-    rendering: np.ndarray  # rendering of the previous Gaussians around the parts, reduced [h, w, 3]
-    target: np.ndarray  # the target, reduced [h, w, 3]
-    scale: float  # reduced pixels per pixel
-
-    def cost_surface(self, weight: np.ndarray) -> _CostSurface:
-        """Match the pixels of a part with the weight m [h, w], not all 0."""
-        box = _box_of(weight > 0.01 * weight.max())
-        # In reduced pixels: twice the grid along an axis, as its corners are farther.
-        surroundings = _surroundings(self.target, box, 4 * _GRID)
-        mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
-        cost = cv2.matchTemplate(surroundings, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
-        return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
-
-
-def _box_of(mask: np.ndarray) -> tuple[slice, slice]:
-    """Return the rows and columns of the smallest box around a mask [h, w] that is not empty."""
-    rows, columns = np.nonzero(mask)
-    return np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-
-
-def _surroundings(image: np.ndarray, box: tuple[slice, slice], margin: int) -> np.ndarray:
-    """Return a box of an image, enlarged by a margin on all sides; beyond its border, the image is
-    continued.
-    """
-    image = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-    return image[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
-
-
-def _reduction(group: ViewGroup, reach: float) -> int:
-    """Return the factor by which the images of views are reduced: it leaves 2 px per step of the
-    grid, if any does.
-    """
-    widest = max(view.camera.width for view in group.views)
-    block = gcd(*group.region.block)
-    return next(
-        f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * widest and block % f == 0)
-    )
-
-
-def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
-    """Return the means of an image's squares of `factor` x `factor` pixels."""
-    height = image.shape[0] // factor
-    width = image.shape[1] // factor
-    whole = image[: height * factor, : width * factor]
-    return (
-        whole if factor == 1 else cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
-    )

@@ -29,8 +29,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.checks import check_mask
-from morgs_mi.core.color_space import BRIGHTEST
 from morgs_mi.core.memory import from_numpy, owned_copy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.method.ssim_layout import (
@@ -50,8 +48,6 @@ from morgs_mi.render.region import Region
 
 _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
 
-# Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
-_MARGIN = 1.0
 _C1 = 0.01**2
 _C2 = 0.03**2
 _TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
@@ -75,16 +71,9 @@ class Target:
         image: [H, W, 3], RGB, encoded: uint8, or floats, of which 1 is white and HDR images have
             larger ones.
         mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
-
-    Raises:
-        ValueError: an image of another shape or type, or that is not finite, or a mask of another
-            shape or type.
     """
 
     def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
-        _check_image(image)
-        if mask is not None:
-            check_mask("Target()", mask, *image.shape[:2])
         self.shape: tuple[int, ...] = image.shape
         self.planes = Planes(*image.shape[:2])
         self.weight: Float | None = None
@@ -124,13 +113,6 @@ class Target:
         error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
         return np.asarray(self.planes.image(error)).reshape(self.shape)
 
-    def minus(self, image: Float, region: Region | None) -> Float:
-        """Return the target minus an image, both flat on a region or the whole view; 0 where
-        masked.
-        """
-        pixels, weight = self.on(region)
-        return pixels - (image if weight is None else image * weight)
-
     def on(self, region: Region | None) -> tuple[Float, Float | None]:
         """Return the target on a region, flat, 0 outside the view, and the weights of its numbers;
         None: 1.
@@ -142,12 +124,6 @@ class Target:
         places, valid = self.places_on(region)
         weight = None if self.weight is None else dr.gather(mi.Float, self.weight, places)
         return dr.gather(mi.Float, self.pixels, places, active=valid), weight
-
-    def gradient_on(self, region: Region) -> tuple[Float, Float]:
-        """Return the derivatives of the target along x and y on a region, flat, per px, by Sobel's
-        filter.
-        """
-        return self.planes.gradient_on(self.pixels, region)
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
         """Return (places of the numbers of an image on a region, mask of those in the view)."""
@@ -177,34 +153,39 @@ class Target:
         )
 
 
-def _check_image(image: np.ndarray) -> None:
-    is_array = isinstance(image, np.ndarray)
-    if not is_array or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        kind = list(image.shape) if is_array else type(image).__name__
-        raise ValueError(f"Target(): `image` must be [H, W, 3], got {kind}; pass one RGB image.")
-    if image.dtype != np.uint8:
-        _check_light(image)
+class Recon(dr.CustomOp):
+    """L_recon, with the derivative that `eval` computes along with it."""
 
-
-def _check_light(image: np.ndarray) -> None:
-    """Raise an error unless an image has floats in the range of encoded values."""
-    is_float = image.dtype.kind == "f"
-    low, high = (image.min(), image.max()) if is_float else (np.nan, np.nan)
-    if not (low >= -_MARGIN and high <= BRIGHTEST):
-        kind = f"{image.dtype} from {low:g} to {high:g}" if is_float else str(image.dtype)
-        raise ValueError(
-            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, "
-            f"got {kind}; divide 8-bit values by 255."
-        )
-
-
-class _Recon(dr.CustomOp):
     gradient: Float
 
-    def finish(self, gradient: Float, loss: Float) -> Float:
-        """Store the derivative for `backward`, and return the value."""
-        self.gradient = gradient
-        dr.eval(gradient, loss)
+    def eval(self, x: Float, target: Target, weight: float, region: Region | None) -> Float:
+        planes = target.planes
+        places, valid = (None, True) if region is None else target.places_on(region)
+        if places is None:
+            # In memory allocated by Dr.Jit.
+            image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))
+        else:
+            if target.surroundings is None:
+                target.surroundings = target.pixels + 0
+            image = target.surroundings
+            mode = dr.ReduceMode.NoConflicts
+            dr.scatter(image, target.masked(x, places), places, active=valid, mode=mode)
+        on = target.windows_on(region)
+        scale = dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+        height = dr.opaque(mi.Int32, planes.height)
+        dr.eval(image)
+        arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
+        derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
+        arguments = (on.pixels.lanes, height, image, target.pixels, derivatives, scale)
+        (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
+        structure = dr.opaque(mi.Float, on.windows.num_pixels) - dr.sum(ssim)
+        loss = scale * ((1 - weight) * dr.sum(error) + weight * structure)
+        if places is None:
+            self.gradient = planes.image(target.masked(gradient))
+        else:
+            gradient = dr.gather(mi.Float, gradient, places, active=valid)
+            self.gradient = target.masked(gradient, places)
+        dr.eval(self.gradient, loss)
         return loss
 
     def backward(self) -> None:
@@ -215,44 +196,6 @@ class _Recon(dr.CustomOp):
 
     def name(self) -> str:
         return "morgs_mi.recon_loss"
-
-
-class WholeView(_Recon):
-    def eval(self, x: Float, target: Target, weight: float) -> Float:
-        planes = target.planes
-        # In memory allocated by Dr.Jit.
-        image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))
-        gradient, loss = _passes(image, target, weight, target.windows_on(None))
-        return self.finish(planes.image(target.masked(gradient)), loss)
-
-
-class OnRegion(_Recon):
-    def eval(self, x: Float, target: Target, weight: float, region: Region) -> Float:
-        if target.surroundings is None:
-            target.surroundings = target.pixels + 0
-        image = target.surroundings
-        places, valid = target.places_on(region)
-        dr.scatter(
-            image, target.masked(x, places), places, active=valid, mode=dr.ReduceMode.NoConflicts
-        )
-        gradient, loss = _passes(image, target, weight, target.windows_on(region))
-        return self.finish(
-            target.masked(dr.gather(mi.Float, gradient, places, active=valid), places), loss
-        )
-
-
-def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
-    """Return dL/dx in planes, defined on the runs of `on.pixels`, and L over the runs of `on`."""
-    planes = target.planes
-    scale = dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
-    height = dr.opaque(mi.Int32, planes.height)
-    dr.eval(image)
-    arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
-    derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
-    arguments = (on.pixels.lanes, height, image, target.pixels, derivatives, scale)
-    (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
-    structure = dr.opaque(mi.Float, on.windows.num_pixels) - dr.sum(ssim)
-    return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
 
 
 def _statistics_pass(

@@ -175,46 +175,49 @@ class Planes:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around
         it.
         """
-        strip, first, end = _cell_runs(_enlarged(self._cells(region), reach).T)
+        cells = np.ones((self.height, self.num_strips), bool)  # the strips of each row
+        if region is not None:
+            mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
+            cells = np.any(mask.reshape(self.height, self.num_strips, STRIP), axis=2)
+        cells = np.pad(cells, ((reach, reach), (1, 1)))
+        if reach:  # those within `reach` rows, or in the next strip, too
+            cells[:, 1:-1] |= cells[:, 2:] | cells[:, :-2]
+            cells[:, 0] = cells[:, 1]
+            cells[:, -1] = cells[:, -2]
+            count = np.pad(cells, ((1, 0), (0, 0))).cumsum(0)
+            cells = count[2 * reach + 1 :] > count[: -2 * reach - 1]
+        # The runs of cells in each column, in parts that are not too long.
+        edges = np.diff(np.pad(cells.T, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+        strip, first = np.nonzero(edges == 1)
+        end = np.nonzero(edges == -1)[1]
+        parts = -(-(end - first) // _LONGEST)
+        index = np.repeat(np.arange(len(strip)), parts)
+        part = np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts)
+        first = first[index] + _LONGEST * part
+        end = np.minimum(end[index], first + _LONGEST)
+        strip = strip[index]
+        # The lanes of a packet are neighbours in one column.
+        order = np.lexsort((strip, first, (strip + _SPARE - 1) // COLUMN))
+        strip = strip[order]
+        first = first[order]
+        end = end[order]
         columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
+        component = np.repeat(np.arange(3), len(strip))
+        x = np.tile(strip - 1, 3) * STRIP  # strip 1 is the first of the image
+        left, middle, right = (
+            from_numpy(
+                mi.UInt32,
+                _place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP,
+            )
+            for k in (-1, 0, 1)
+        )
         lanes = Lanes(
-            self._lane_places(strip),
+            (left, middle, right),
             from_numpy(mi.Int32, np.tile(first, 3)),
             from_numpy(mi.Int32, np.tile(end, 3)),
             from_numpy(mi.UInt32, np.tile(columns, 3)),
         )
         return Runs(lanes, 3 * int(((end - first) * columns).sum()))
-
-    def _cells(self, region: Region | None) -> np.ndarray:
-        """Return the strips of each row that a region, or the whole view, covers, bool [H, S]."""
-        if region is None:
-            return np.ones((self.height, self.num_strips), bool)
-        mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
-        return np.any(mask.reshape(self.height, self.num_strips, STRIP), axis=2)
-
-    def _lane_places(self, strip: np.ndarray) -> tuple[UInt32, UInt32, UInt32]:
-        """Return `Lanes.places` of strips [n] in all three planes; 1 is the first of an image."""
-        component = np.repeat(np.arange(3), len(strip))
-        x = np.tile(strip - 1, 3) * STRIP
-        places = (
-            _place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP
-            for k in (-1, 0, 1)
-        )
-        return tuple(from_numpy(mi.UInt32, place) for place in places)  # pyright: ignore[reportReturnType]
-
-
-def _enlarged(cells: np.ndarray, reach: int) -> np.ndarray:
-    """Return cells [H, S] with a column of cells added on either side, and those within `reach`
-    rows, or in the next strip, of a set one.
-    """
-    cells = np.pad(cells, ((reach, reach), (1, 1)))
-    if not reach:
-        return cells
-    cells[:, 1:-1] |= cells[:, 2:] | cells[:, :-2]
-    cells[:, 0] = cells[:, 1]
-    cells[:, -1] = cells[:, -2]
-    count = np.pad(cells, ((1, 0), (0, 0))).cumsum(0)
-    return count[2 * reach + 1 :] > count[: -2 * reach - 1]
 
 
 def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit:
@@ -241,27 +244,3 @@ def _place(component: Jit, y: Jit, x: Jit, height: Jit, num_columns: Jit) -> Jit
     x = x + _SPARE * STRIP
     column = component * num_columns + x // (COLUMN * STRIP)
     return (column * height + y) * (COLUMN * STRIP) + x % (COLUMN * STRIP)
-
-
-def _cell_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (line, first, end) of all runs of set cells in the lines of [L, M], none longer than
-    `_LONGEST`.
-    """
-    line, first, end = _long_runs(cells)
-    parts = -(-(end - first) // _LONGEST)
-    index = np.repeat(np.arange(len(line)), parts)
-    first = first[index] + _LONGEST * (
-        np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts)
-    )
-    end = np.minimum(end[index], first + _LONGEST)
-    line = line[index]
-    # The lanes of a packet are neighbours in one column.
-    order = np.lexsort((line, first, (line + _SPARE - 1) // COLUMN))
-    return line[order], first[order], end[order]
-
-
-def _long_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (line, first, end) of all runs of set cells in the lines of [L, M]."""
-    edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    line, first = np.nonzero(edges == 1)
-    return line, first, np.nonzero(edges == -1)[1]

@@ -75,9 +75,22 @@ class KeyImages:
             names: of the maps.
         """
         drawing = self.group.draw(gaussians)
-        image, sizes = self._maps(drawing, names)
-        ends = np.cumsum(sizes)
-        parts = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
+        with dr.suspend_grad():
+            error = self._difference(drawing)
+            dr.eval(error)
+            gradient = self._gradient if {"normal", "right"} & set(names) else (error, error)
+            lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
+            pixel = [
+                [dr.gather(mi.Float, values, 3 * lane + c) for c in range(3)]
+                for values in (error, *gradient)
+            ]
+            columns = [MAPS[name](*pixel) for name in names]
+            *ends, count = np.cumsum([len(column) for column in columns]).tolist()
+            image = dr.empty(mi.Float, dr.width(lane) * count)
+            for k, value in enumerate(v for column in columns for v in column):
+                dr.scatter(image, value, lane * count + k, mode=dr.ReduceMode.NoConflicts)
+            dr.eval(image)
+        parts = np.split(drawing.sums(image, count), ends, axis=-1)
         return {
             name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, parts, strict=True)
         }
@@ -106,28 +119,6 @@ class KeyImages:
         with dr.suspend_grad():
             return float(dr.sum(dr.abs(self._difference(self.group.draw(gaussians))))[0]) / 3
 
-    def _maps(self, drawing: Drawing, names: Sequence[str]) -> tuple[Float, list[int]]:
-        """Return the numbers of some maps at every pixel, flat, and how many each map has."""
-        with dr.suspend_grad():
-            error = self._difference(drawing)
-            dr.eval(error)
-            images = [
-                error,
-                *(self._gradient if {"normal", "right"} & set(names) else (error, error)),
-            ]
-            lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
-            pixel = [
-                [dr.gather(mi.Float, image, 3 * lane + c) for c in range(3)] for image in images
-            ]
-            columns = [MAPS[name](*pixel) for name in names]
-            sizes = [len(column) for column in columns]
-            count = sum(sizes)
-            image = dr.empty(mi.Float, dr.width(lane) * count)
-            for k, value in enumerate(v for column in columns for v in column):
-                dr.scatter(image, value, lane * count + k, mode=dr.ReduceMode.NoConflicts)
-            dr.eval(image)
-        return image, sizes
-
     def _difference(self, drawing: Drawing) -> Float:
         """Return e, flat [A * block_height * block_width * 3]; 0 where masked."""
         pixels, weights = self._pixels
@@ -154,7 +145,8 @@ class KeyImages:
     def _gradient(self) -> tuple[Float, Float]:
         """The derivatives of the targets along x and y, per px, flat on the group."""
         pairs = zip(self._targets, self.group.regions, strict=True)
-        x, y = zip(*(target.gradient_on(region) for target, region in pairs), strict=True)
+        gradients = [target.planes.gradient_on(target.pixels, region) for target, region in pairs]
+        x, y = zip(*gradients, strict=True)
         return _end_to_end(x), _end_to_end(y)
 
 

@@ -19,7 +19,7 @@ from morgs_mi.core.files import locked_folder
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
-from morgs_mi.fit.capacity import check_capacity
+from morgs_mi.fit.budget import check_capacity
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.stream_header import about_lenses, as_fitted

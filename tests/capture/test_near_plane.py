@@ -25,7 +25,7 @@ from tests.quick import quick
 from tests.scenes.cameras import circle, look_at_cameras
 
 RADIUS = 0.08  # of the dark ball around camera 0
-CONFIG = quick(num_gaussians=600, first_frame_steps=150, dropping=0.0)
+CONFIG = quick(num_gaussians=600, first_frame_steps=150, dropout=0.0)
 
 
 def dome() -> list[Camera]:

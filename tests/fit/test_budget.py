@@ -15,7 +15,7 @@ from tests.scenes.ball import bytes_of, images_of, opaque_ball, views
 PIXELS = 64 * 48
 # Images of the ball ask for more Gaussians than the most.
 DETAIL = DetailConfig(per_detail=100.0, least_gaussians=5_000, most_gaussians=50_000)
-CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropping=0.0, density=DensityConfig(rounds=0))
+CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropout=0.0, density=DensityConfig(rounds=0))
 
 
 def planned(seconds: float, config: FitConfig = CONFIG) -> Plan:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from morgs_mi.fit.empty_space import in_empty_space
+from morgs_mi.fit.initialise import in_empty_space
 from tests.scenes.cameras import look_at_cameras
 
 

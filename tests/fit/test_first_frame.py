@@ -240,12 +240,12 @@ def test_fit_first_frame__fits_views_of_different_sizes(images):
         assert errors[1] < 0.5 * errors[0]
 
 
-# ---- dropping, and what does not change
+# ---- dropout, and what does not change
 # ------------------------------------------------------------------
 
 
 def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_result(images, drawn):
-    result = fit(images, ball(80), dataclasses.replace(CONFIG, dropping=0.25))
+    result = fit(images, ball(80), dataclasses.replace(CONFIG, dropout=0.25))
     left_out = np.array([np.asarray(gaussians.opacities) < 1e-6 for gaussians in drawn])
     assert left_out.mean() == pytest.approx(0.25, abs=0.05)
     assert len(np.unique(left_out, axis=0)) == len(drawn)  # others in each step
@@ -262,7 +262,7 @@ def test_fit_first_frame__keeps_the_confidence(images):
 
 @pytest.mark.slow
 def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images):
-    config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12, dropping=0.2)
+    config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12, dropout=0.2)
     first, second, other = (
         values_of(fit(images, ball(60, 1), config, seed).gaussians) for seed in (5, 5, 6)
     )

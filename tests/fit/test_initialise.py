@@ -9,8 +9,14 @@ import pytest
 
 from morgs_mi import Camera
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
-from morgs_mi.fit.empty_space import in_empty_space
-from morgs_mi.fit.initialise import MIN_POINTS, _in_light, fill_points, initial_points, seed_points
+from morgs_mi.fit.initialise import (
+    MIN_POINTS,
+    _in_light,
+    fill_points,
+    in_empty_space,
+    initial_points,
+    seed_points,
+)
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 

@@ -85,7 +85,7 @@ def test_view__reduced_pixels_are_valid_if_all_that_they_cover_are():
 
 def test_first_frame_problem__reduces_all_views():
     two = replace(problem([]), views=(large_view(), large_view()))
-    assert [image.shape for image in two.reduced(80).images] == [(60, 80, 3)] * 2
+    assert [view.image.shape for view in two.reduced(80).views] == [(60, 80, 3)] * 2
 
 
 def test_withheld_blocks__divide_the_valid_pixels():

@@ -8,8 +8,7 @@ import pytest
 from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, mask_refiner
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from tests.method.moving_disc import moving_disc, observed
 
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
@@ -47,7 +46,7 @@ def test_motion_mask__passes_its_config_to_threshold_and_refiner():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     motion = observed(image, previous).motion
     for config in (MaskConfig(floor=20), MaskConfig(superpixel_share=0.2)):
-        expected = mask_refiner("superpixels+grabcut", config)(
+        expected = MASK_REFINERS.make("superpixels+grabcut", config)(
             image, flow_mask(motion, config=config)
         )
         np.testing.assert_array_equal(
@@ -64,7 +63,7 @@ def test_observe_key_views__masks_are_those_of_the_configured_method():
     for method in MASK_REFINERS.names:
         observation = observe_key_views(pair, "dis", method)[7]
         mask = flow_mask(observation.motion, observation.reliable)
-        np.testing.assert_array_equal(observation.mask, mask_refiner(method)(image, mask))
+        np.testing.assert_array_equal(observation.mask, MASK_REFINERS.make(method)(image, mask))
     assert observe_key_views(pair)[7].mask is None
 
 
@@ -99,15 +98,3 @@ def test_flow_mask__excludes_unreliable_pixels():
     reliable = np.ones((8, 8), bool)
     reliable[0] = False
     assert flow_mask(motion, reliable).sum() == 8
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((np.zeros((4, 4)),), r"\[H, W, 2\], got \(4, 4\)"),
-        ((np.zeros((4, 4, 2)), np.ones((3, 4), bool)), r"got \(3, 4\)"),
-    ],
-)
-def test_flow_mask__rejects_bad_input(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        flow_mask(*arguments)

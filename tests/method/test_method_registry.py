@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def registry() -> Registry[str, int]:
-    registry: Registry[str, int] = Registry("paint()", "brush")
+    registry: Registry[str, int] = Registry("paint()", "brush", int)
     registry.register("file", "PATH")(lambda argument, config: f"file {argument} {config}")
     registry.register("round")(lambda argument, config: f"round {argument}{config}")
     return registry
@@ -82,8 +82,8 @@ def test_motion_config__accepts_arguments_whose_files_are_not_there_yet():
 FLOW = """
 import numpy as np
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
-source = flow_source(MotionConfig(flow_method="constant:3,0").flow_method)
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
+source = FLOW_SOURCES.make(MotionConfig(flow_method="constant:3,0").flow_method)
 flow, forward_flow = source(FramePair(*np.zeros((2, 4, 5, 3))))
 assert flow.shape == forward_flow.shape == (4, 5, 2)
 assert (forward_flow == (3, 0)).all() and (flow == (-3, 0)).all()
@@ -92,10 +92,10 @@ MASKS = """
 import sys
 import numpy as np
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 mask = np.zeros((9, 9), bool)
 mask[4, 4] = True
-refiner = mask_refiner(MotionConfig(mask_method="dilate:1").mask_method)
+refiner = MASK_REFINERS.make(MotionConfig(mask_method="dilate:1").mask_method)
 assert refiner(np.zeros((9, 9, 3)), mask).sum() == 5
 assert "onnxruntime" not in sys.modules  # imported by the refiner that needs it
 """

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import motion_model, moved, sparse_product
+from morgs_mi.method.motion_model import MOTION_MODELS, moved, sparse_product
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_scene, to_gaussians
 
@@ -24,11 +24,11 @@ def tensor(*shape: int) -> mi.TensorXf:
 
 
 def test_motion_model__is_the_one_that_the_setting_selects():
-    assert motion_model(MotionConfig()) is None
+    assert MOTION_MODELS.make("none", MotionConfig()) is None
     with pytest.raises(
         ValueError, match=r"MotionConfig\(\): `model` must be one of none.*, got 'mesh'\."
     ):
-        motion_model(MotionConfig(model="mesh"))
+        MotionConfig(model="mesh")
 
 
 def test_sparse_product__is_that_of_dense_matrices():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.method.neighbours import NeighbourIndex
+from morgs_mi.method.cohesion import NeighbourIndex
 
 POINTS = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
 
@@ -16,9 +16,9 @@ def test_nearest__are_the_nearest_others_in_order(count):
     expected = np.argsort(distance, axis=1)[:, 1 : count + 1]
     index = NeighbourIndex(POINTS)
     np.testing.assert_array_equal(index.nearest(count), expected)
-    np.testing.assert_array_equal(index.nearest_of(np.array([4, 2]), count), expected[[4, 2]])
+    np.testing.assert_array_equal(index.nearest(count, np.array([4, 2])), expected[[4, 2]])
 
 
 def test_nearest__has_none_for_a_single_point():
     assert NeighbourIndex(POINTS[:1]).nearest(8).shape == (1, 0)
-    assert NeighbourIndex(POINTS[:1]).nearest_of(np.arange(0), 8).shape == (0, 0)
+    assert NeighbourIndex(POINTS[:1]).nearest(8, np.arange(0)).shape == (0, 0)

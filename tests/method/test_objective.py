@@ -137,7 +137,9 @@ def test_weights_of__are_those_of_the_settings():
 @pytest.fixture
 def registry(monkeypatch):
     """Return an empty registry of terms."""
-    monkeypatch.setattr(objective, "LOSS_TERMS", Registry("ObjectiveConfig()", "terms"))
+    monkeypatch.setattr(
+        objective, "LOSS_TERMS", Registry("ObjectiveConfig()", "terms", objective.ObjectiveConfig)
+    )
     return objective.LOSS_TERMS
 
 

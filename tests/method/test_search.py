@@ -12,11 +12,15 @@ from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.search import SearchConfig, _MatchedView, _reduction, search_motion
+from morgs_mi.method.search import (
+    SearchConfig,
+    _CostSurface,
+    _matching_cost,
+    _reduction,
+    search_motion,
+)
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.render.view_group import ViewGroup
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
@@ -155,7 +159,7 @@ def test_cost_surface__is_the_weighted_squared_difference():
     image, next_image = rng.random((2, 48, 64, 3)).astype(np.float32)
     weight = np.zeros((48, 64), np.float32)
     weight[20:26, 30:35] = rng.random((6, 5))
-    surface = _MatchedView(camera, image, next_image, 1.0).cost_surface(weight)
+    surface = _CostSurface(_matching_cost(next_image, image, weight), camera, 1.0)
     shifts = np.array([(0, 0), (4, -3), (-11, 9)])
     expected = [
         np.sum(
@@ -176,6 +180,4 @@ def test_cost_surface__is_the_weighted_squared_difference():
     [(1352, (8, 4), 4), (1352, (4, 2), 2), (700, (8, 4), 2), (160, (8, 4), 1)],
 )
 def test_reduction__leaves_two_pixels_per_step_and_divides_the_blocks(width, block, factor):
-    camera = look_at_cameras([(0, 0, -3)], 45, width, 48)[0]
-    config = RenderConfig(block_width=block[0], block_height=block[1])
-    assert _reduction(ViewGroup([ActiveView(camera, config)]), 0.1) == factor
+    assert _reduction(width, block, 0.1) == factor

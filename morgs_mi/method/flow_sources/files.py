@@ -27,8 +27,12 @@ import numpy as np
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.listing import listed
 from morgs_mi.io.numbering import frame_numbers
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, FramePair
+from morgs_mi.method.flow_sources.flow_registry import (
+    FLOW_SOURCES,
+    FlowConfig,
+    FlowSource,
+    FramePair,
+)
 
 SUFFIXES = (".flo", ".exr")
 

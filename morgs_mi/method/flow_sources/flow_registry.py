@@ -12,11 +12,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.core.config import config_class
 from morgs_mi.method.method_registry import Registry
+
+
+@config_class
+class FlowConfig:
+    """Settings of OpenCV's methods and of the forward-backward check.
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+
+    fine_width: Annotated[int, Ge(0)] = 480
+    """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half
+    resolution.
+    """
+    consistency_relative: Annotated[float, Ge(0)] = 0.01
+    """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both
+    flows.
+    """
+    consistency_absolute: Annotated[float, Ge(0)] = 0.5
+    """Forward-backward check: tolerated squared mismatch of the shortest flows, px^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,24 +60,13 @@ class FramePair:
 
 FlowSource = Callable[[FramePair], tuple[np.ndarray, np.ndarray]]
 
-FLOW_SOURCES: Registry[FlowSource, FlowConfig] = Registry("flow_source()", "flow_method")
-
-
-def flow_source(flow_method: str, config: FlowConfig | None = None) -> FlowSource:
-    """Return the flow source that a string selects.
-
-    Args:
-        flow_method: one of `FLOW_SOURCES.usages`: a key of `FLOW_METHODS`; ``files:FOLDER`` (see
-            `files`); ``onnx:FILE`` (see `network`) for a network that takes values from 0 to 255,
-            ``onnx-unit:FILE`` for one that takes 0 to 1, ``onnx-signed:FILE`` for one that takes -1
-            to 1.
-        config: settings of the methods; None: the defaults.
-
-    Raises:
-        FileNotFoundError: the folder or file is missing.
-        ValueError: the string selects no source, or as `FlowNetwork`.
-    """
-    return FLOW_SOURCES.make(flow_method, config or FlowConfig())
+FLOW_SOURCES: Registry[FlowSource, FlowConfig] = Registry(
+    "MotionConfig()", "flow_method", FlowConfig
+)
+"""Sources by name: a key of `FLOW_METHODS`; ``files:FOLDER`` (see `files`); ``onnx:FILE`` (see
+`network`) for a network that takes values from 0 to 255, ``onnx-unit:FILE`` for one that takes 0 to
+1, ``onnx-signed:FILE`` for one that takes -1 to 1.
+"""
 
 
 def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> FlowSource:
@@ -67,25 +78,15 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
     """
 
     def source(pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
-        check_images("flow_source()", pair.image, pair.previous)
-        if pair.box is None:
-            return method(pair.image, pair.previous), method(pair.previous, pair.image)
-        return _flows_in_box(method, pair, pair.box)
+        check_images("FlowSource()", pair.image, pair.previous)
+        box = pair.box or np.s_[:, :]
+        image, previous = (np.ascontiguousarray(v[box]) for v in (pair.image, pair.previous))
+        backward, forward = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
+        backward[box] = method(image, previous)
+        forward[box] = method(previous, image)
+        return backward, forward
 
     return source
-
-
-def _flows_in_box(
-    method: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    pair: FramePair,
-    box: tuple[slice, slice],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return both flows of a pair inside a box, 0 outside it."""
-    image, previous = (np.ascontiguousarray(whole[box]) for whole in (pair.image, pair.previous))
-    flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
-    flows[0][box] = method(image, previous)
-    flows[1][box] = method(previous, image)
-    return flows[0], flows[1]
 
 
 def check_images(place: str, image: np.ndarray, previous: np.ndarray) -> None:

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
+    FlowConfig,
     FlowSource,
     both_directions,
     check_images,

@@ -11,30 +11,45 @@ it is imported.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.core.config import config_class
 from morgs_mi.method.method_registry import Registry
+
+
+@config_class
+class MaskConfig:
+    """Settings of the flow mask (eq. 9) and of its refinement (eq. 10).
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+
+    threshold_mads: Annotated[float, Ge(0)] = 4.0
+    """Speed above which a pixel moves: this many median absolute deviations above the median."""
+    floor: Annotated[float, Ge(0)] = 0.5
+    """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
+    proportional to the width, as the motion of a scene is."""
+    working_width: Annotated[int, Ge(1)] = 320
+    """Width in pixels to which GrabCut and superpixels reduce an image. Their cost grows with the
+    number of pixels, and a mask needs the object's outline, not its details."""
+    superpixel_share: Annotated[float, Ge(0)] = 0.75
+    """Share of a superpixel that must lie in the flow mask. Flow bleeds outwards onto the static
+    surroundings of an object, all of which a bare majority would include."""
+    prompts: Annotated[int, Ge(1)] = 16
+    """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
+    of the decoder; the smaller ones stay as they are in the flow mask."""
+
 
 MaskRefiner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-MASK_REFINERS: Registry[MaskRefiner, MaskConfig] = Registry("mask_refiner()", "mask_method")
-
-
-def mask_refiner(mask_method: str, config: MaskConfig | None = None) -> MaskRefiner:
-    """Return the mask refiner that a string selects.
-
-    Args:
-        mask_method: one of `MASK_REFINERS.usages`, e.g. ``grabcut`` (see `opencv_masks`) or
-            ``sam2:ENCODER.onnx,DECODER.onnx`` (see `network`).
-        config: settings of the refiners; None: the defaults.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: the string selects no refiner, or as `SegmentNetwork`.
-    """
-    return MASK_REFINERS.make(mask_method, config or MaskConfig())
+MASK_REFINERS: Registry[MaskRefiner, MaskConfig] = Registry(
+    "MotionConfig()", "mask_method", MaskConfig
+)
+"""Refiners by name, e.g. ``grabcut`` (see `opencv_masks`)."""
 
 
 @MASK_REFINERS.register("none")

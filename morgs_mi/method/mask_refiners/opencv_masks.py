@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskRefiner
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig, MaskRefiner
 
 # Radius in pixels of the opening that removes specks.
 _OPENING = 1

@@ -350,7 +350,7 @@ def register_camera(
     render = render or RenderConfig()
     priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
     deviations = prior_deviations(extent, priors)
-    target = view.target
+    target = Target(view.image, view.mask)
     means = np.asarray(gaussians.means, np.float64)
     best = np.zeros((1, CHANGES))
     for blur in (*_BLURS, 0.0):
@@ -449,7 +449,7 @@ def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
         num_gaussians=how.gaussians,
         first_frame_steps=how.steps // 2 if is_later else how.steps,
         first_frame_rates=rates,
-        dropping=0.0,
+        dropout=0.0,
         density=replace(config.density, rounds=0),
     )
 
@@ -467,7 +467,10 @@ def _joint_step(
     """
     means = np.asarray(gaussians.means, np.float64)
     changed_views = _changed(views, changes)
-    shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed_views]
+    shifts = [
+        _shifts(gaussians, view.camera, Target(view.image, view.mask), blur, render)
+        for view in changed_views
+    ]
     variance = _ALIKE * np.mean([error for *_, error in shifts])
     equations = NormalEquations(len(views), len(means))
     for v, (view, (G, b, _)) in enumerate(zip(changed_views, shifts, strict=True)):

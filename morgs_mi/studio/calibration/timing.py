@@ -299,7 +299,7 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
         sh_degree=0,
         num_gaussians=GAUSSIANS // divisor,
         first_frame_steps=STEPS // divisor,
-        dropping=0.0,
+        dropout=0.0,
         density=DensityConfig(rounds=0),
     )
     views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]

@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import unit_values
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FlowSource, both_directions
+from morgs_mi.method.flow_sources.flow_registry import FlowConfig, FlowSource, both_directions
 from morgs_mi.studio.networks.onnx_file import OnnxNetwork, written_shapes
 
 # RAFT and similar networks halve the size three times.

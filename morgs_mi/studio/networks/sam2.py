@@ -24,8 +24,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.documentation import page
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
-from morgs_mi.method.mask_refiners.mask_registry import MaskRefiner
+from morgs_mi.method.mask_refiners.mask_registry import MaskConfig, MaskRefiner
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask
 from morgs_mi.studio.networks.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
 
@@ -181,7 +180,7 @@ def sam2(files: str, config: MaskConfig) -> MaskRefiner:
     encoder, _, decoder = files.partition(",")
     if not encoder or not decoder:
         raise ValueError(
-            "mask_refiner(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got "
+            "MotionConfig(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got "
             f"{'sam2:' + files!r}."
         )
     network = SegmentNetwork(encoder, decoder, config.prompts)

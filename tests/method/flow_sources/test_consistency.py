@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow import consistency_mask
+from morgs_mi.method.flow_sources.flow_registry import FlowConfig
 
 
 def constant_flow(x, y=0.0):

@@ -11,7 +11,7 @@ import pytest
 from morgs_mi.io.exr import write_exr
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.files import FlowFolder, read_flow
-from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 
 
 def random_flow(height=6, width=9, seed=0):
@@ -64,7 +64,7 @@ def test_flow_source__reads_both_directions_of_a_frame(folder):
     for frame in (1, 2):
         images = np.zeros((2, 6, 9, 3), np.uint8)
         pair = FramePair(*images, camera="cam00", frame=frame)
-        back, forward_flow = flow_source(f"files:{folder}")(pair)
+        back, forward_flow = FLOW_SOURCES.make(f"files:{folder}")(pair)
         np.testing.assert_array_equal(back, random_flow(seed=frame))
         np.testing.assert_array_equal(forward_flow, random_flow(seed=frame - 1 + 10))
 
@@ -178,7 +178,7 @@ def test_flow_folder__rejects_two_files_of_one_frame(folder):
 
 def test_flow_source__rejects_a_missing_flow_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
-        flow_source(f"files:{tmp_path / 'flow'}")
+        FLOW_SOURCES.make(f"files:{tmp_path / 'flow'}")
 
 
 def test_FlowFolder__lists_a_folder_again_only_for_a_file_that_was_added(folder, monkeypatch):

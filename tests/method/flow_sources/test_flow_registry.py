@@ -6,16 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, flow_source
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig
 from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS
 
 ROOT = Path(__file__).parents[3]
 
 
 def test_flow_source__is_cached_by_name_and_config():
-    assert flow_source("dis") is flow_source("dis", FlowConfig())
-    assert flow_source("dis") is not flow_source("dis", FlowConfig(fine_width=0))
+    assert FLOW_SOURCES.make("dis") is FLOW_SOURCES.make("dis", FlowConfig())
+    assert FLOW_SOURCES.make("dis") is not FLOW_SOURCES.make("dis", FlowConfig(fine_width=0))
 
 
 def test_flow_sources__include_every_method_of_opencv():
@@ -28,9 +27,9 @@ def test_flow_source__rejects_unknown_methods_with_the_known_ones(method):
         "one of dis, dis-fine, .*, files:FOLDER, onnx:FILE, onnx-unit:FILE, onnx-signed:FILE, got "
     )
     with pytest.raises(
-        ValueError, match=rf"flow_source\(\): `flow_method` must be {names_text}{method!r}\."
+        ValueError, match=rf"MotionConfig\(\): `flow_method` must be {names_text}{method!r}\."
     ):
-        flow_source(method)
+        FLOW_SOURCES.make(method)
 
 
 def test_flow_page__lists_every_source():

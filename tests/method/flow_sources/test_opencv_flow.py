@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig, FramePair
 from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS, optical_flow
 from tests.method.moving_disc import moving_disc, observed, texture
 
@@ -96,7 +95,7 @@ def test_flow_source__passes_its_config_to_the_method():
         optical_flow(image, previous, config=FlowConfig(fine_width=width)) for width in (480, 64)
     )
     assert not np.array_equal(flow, changed)
-    source_flow, _ = flow_source("dis", FlowConfig(fine_width=64))(FramePair(image, previous))
+    source_flow, _ = FLOW_SOURCES.make("dis", FlowConfig(fine_width=64))(FramePair(image, previous))
     np.testing.assert_array_equal(source_flow, changed)
 
 
@@ -124,7 +123,7 @@ def test_optical_flow__is_zero_in_images_below_a_least_side(monkeypatch, least, 
 def test_both_directions__computes_flow_inside_the_box_alone():
     previous, image, _ = moving_disc(64, 96, shift=(6, 1))
     box = slice(10, 60), slice(20, 90)
-    flow, forward_flow = flow_source("dis")(FramePair(image, previous, box=box))
+    flow, forward_flow = FLOW_SOURCES.make("dis")(FramePair(image, previous, box=box))
     np.testing.assert_array_equal(flow[box], optical_flow(image[box], previous[box]))
     np.testing.assert_array_equal(forward_flow[box], optical_flow(previous[box], image[box]))
     for each in (flow, forward_flow):

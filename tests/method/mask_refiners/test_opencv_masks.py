@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.evaluate.metrics import iou
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask, refine_mask, vote_superpixels
 from tests.method.moving_disc import moving_disc
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 from morgs_mi.studio.networks.flow_network import FlowNetwork
 from tests.assertions import assert_close
 from tests.scenes.tiny_network import export, export_lookup, known_flow
@@ -37,11 +37,11 @@ def test_flow_network__returns_the_known_flow_at_any_size(network, size):
 )
 def test_flow_source__runs_a_network_both_ways_in_its_value_range(network, kind, low, high):
     image, previous = image_pair(24, 40)
-    back, forward_flow = flow_source(f"{kind}:{network}")(FramePair(image, previous))
+    back, forward_flow = FLOW_SOURCES.make(f"{kind}:{network}")(FramePair(image, previous))
     a, b = (low + (high - low) / 255 * each.astype(float) for each in (image, previous))
     assert_close(back, known_flow(a, b), atol=TOLERANCE)
     assert_close(forward_flow, known_flow(b, a), atol=TOLERANCE)
-    floats = flow_source(f"{kind}:{network}")(FramePair(image / 255, previous / 255))
+    floats = FLOW_SOURCES.make(f"{kind}:{network}")(FramePair(image / 255, previous / 255))
     assert_close(floats[0], back, atol=TOLERANCE)
 
 
@@ -85,7 +85,7 @@ def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
 def test_flow_source__rejects_a_file_that_is_not_a_flow_network(tmp_path, make, exception, message):
     make(tmp_path / "a.onnx")
     with pytest.raises(exception, match=message):
-        flow_source(f"onnx:{tmp_path / 'a.onnx'}")
+        FLOW_SOURCES.make(f"onnx:{tmp_path / 'a.onnx'}")
 
 
 def test_flow_network__rejects_an_output_that_is_not_flow(tmp_path):

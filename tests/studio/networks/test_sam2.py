@@ -7,8 +7,7 @@ import pytest
 
 from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.mask_refiners.mask_config import MaskConfig
-from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from morgs_mi.studio.networks.sam2 import SegmentNetwork, prompts
 from tests.scenes.tiny_network import export as export_flow
 from tests.studio.networks.tiny_segmenter import export_decoder, export_encoder
@@ -113,7 +112,7 @@ def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
     mask = motion_mask(image, motion, method=method)
     assert mask[motion[..., 0] > 0].all()
     assert mask[disc].all()
-    assert mask_refiner(method) is mask_refiner(method)
+    assert MASK_REFINERS.make(method) is MASK_REFINERS.make(method)
 
 
 def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
@@ -145,7 +144,7 @@ def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
 def test_mask_refiner__rejects_files_that_are_not_sam2(tmp_path, files, pair, message):
     encoder, decoder = pair(*files, tmp_path / "other.onnx")
     with pytest.raises(ValueError, match=message):
-        mask_refiner(f"sam2:{encoder},{decoder}")
+        MASK_REFINERS.make(f"sam2:{encoder},{decoder}")
 
 
 def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):
@@ -172,8 +171,10 @@ def test_mask_config__limits_prompts_to_the_largest(files):
     mask = (small | large) & ~hole
     config = MaskConfig(prompts=1)
     for model, filled in (
-        (mask_refiner(f"sam2:{files[0]},{files[1]}", config), large),
+        (MASK_REFINERS.make(f"sam2:{files[0]},{files[1]}", config), large),
         (SegmentNetwork(*files), hole),
     ):
         assert model(image, mask)[hole & filled].mean() > 0.9
-    assert not mask_refiner(f"sam2:{files[0]},{files[1]}", config)(image, mask)[hole & small].any()
+    assert not MASK_REFINERS.make(f"sam2:{files[0]},{files[1]}", config)(image, mask)[
+        hole & small
+    ].any()

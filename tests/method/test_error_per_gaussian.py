@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.fit.fit_config import DensityConfig
-from morgs_mi.method.attribution import Attribution, densification_scores
+from morgs_mi.method.error_per_gaussian import ErrorPerGaussian, densification_scores
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.region import Region
@@ -41,27 +41,27 @@ def scene():
 
 def scores_of(wall, views, targets):
     """Return the scores of one step in each view, and the gradient of the colours from its term."""
-    scores = Attribution(N)
+    scores = ErrorPerGaussian(N)
     for view, target in zip(views, targets, strict=True):
         dr.enable_grad(wall.sh_coeffs)
         image = view.render(wall, ("color",), ("features",), scores.features())
         scores.observe(image, target, view.region)
-        term = scores.term()
+        term = scores.term
         assert np.asarray(term).item() == 0
         dr.backward(term)
         scores.collect()
     return scores.scores(), np.asarray(dr.grad(wall.sh_coeffs))
 
 
-def test_attribution__is_what_back_projection_gives(scene, monkeypatch):
-    monkeypatch.setattr("morgs_mi.method.attribution.NOISE", 0.0)
+def test_error_per_gaussian__is_what_back_projection_gives(scene, monkeypatch):
+    monkeypatch.setattr("morgs_mi.method.error_per_gaussian.NOISE", 0.0)
     scores, gradient = scores_of(*scene)
     expected = densification_scores(*scene)
     assert_close(scores, expected, rtol=1e-4)
     assert not gradient.any(), "the images must not change because of the scores"
 
 
-def test_attribution__ignores_noise():
+def test_error_per_gaussian__ignores_noise():
     """Of an image with noise, errors count only where something else is wrong."""
     rng = np.random.default_rng(1)
     wall = isotropic(random_sheet(rng, N, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (N, 1, 3)))
@@ -77,17 +77,17 @@ def test_attribution__ignores_noise():
     assert scores[~near].max() < DensityConfig().min_error
 
 
-def test_attribution__without_a_step_is_zero():
-    scores = Attribution(3)
+def test_error_per_gaussian__without_a_step_is_zero():
+    scores = ErrorPerGaussian(3)
     scores.collect()
     assert not scores.scores().any()
 
 
-def test_attribution__skips_the_first_steps():
-    scores = Attribution(3, skip=2)
+def test_error_per_gaussian__skips_the_first_steps():
+    scores = ErrorPerGaussian(3, skip=2)
     rendered = []
     for _ in range(3):
         rendered.append(scores.features() is not None)
         scores.collect()
     assert rendered == [False, False, True]
-    assert scores.term() is None
+    assert scores.term is None

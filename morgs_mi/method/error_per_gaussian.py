@@ -1,4 +1,4 @@
-"""Attribution of the rendering error to Gaussians, by their blend weights.
+"""The rendering error of each Gaussian, by its blend weights.
 
 With the error e(x) of a rendered view, E_i = sum_x w_i(x) e(x) is the error attributed to Gaussian
 i there (Bulo et al. 2024), in pixels of full contrast. Its densification score is the largest one
@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.types import Float, Tensor
+from morgs_mi.core.types import Tensor
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import KeyImages
 from morgs_mi.render.active_view import ActiveView
@@ -29,20 +29,24 @@ from morgs_mi.render.region import Region
 NOISE = 3.0
 
 
-class Attribution:
+class ErrorPerGaussian:
     """Densification scores of N Gaussians from the steps of an optimisation that it observes,
     without a pass of their own.
 
     Args:
         count: N.
         skip: number of steps before the first one that counts.
+
+    Attributes:
+        term: sum over the image of feature times error, which is 0: the gradients of the features
+            are E. None: the step does not count.
     """
 
     def __init__(self, count: int, skip: int = 0) -> None:
+        self.term: Tensor | None = None
         self._count = count
         self._skip = skip
         self._probe: Tensor | None = None
-        self._term: Tensor | None = None
         self._largest = dr.zeros(mi.Float, count)
 
     def features(self) -> Tensor | None:
@@ -65,17 +69,17 @@ class Attribution:
             target: its target.
             region: the drawn blocks; None: the whole view.
         """
-        difference = dr.abs(target.minus(dr.detach(image.color).array, region))
+        pixels, weight = target.on(region)
+        color = dr.detach(image.color).array
+        difference = dr.abs(pixels - (color if weight is None else color * weight))
         pixel = dr.arange(mi.UInt32, dr.width(difference) // 3) * 3
         error = sum(dr.gather(mi.Float, difference, pixel + c) for c in range(3)) / 3
-        error = dr.maximum(error - NOISE * _typical(error), 0)
-        self._term = dr.sum(image.features * mi.TensorXf(error, image.features.shape), axis=None)
-
-    def term(self) -> Tensor | None:
-        """Return the sum over the image of feature times error, which is 0: the gradients of the
-        features are E.
-        """
-        return self._term
+        # About the median of the errors that are not 0: the mean of those below twice the mean.
+        mean = dr.sum(error) / dr.maximum(mi.Float(dr.count(error > 0)), 1)
+        small = (error > 0) & (error < 2 * mean)
+        typical = dr.sum(dr.select(small, error, 0)) / dr.maximum(mi.Float(dr.count(small)), 1)
+        error = dr.maximum(error - NOISE * typical, 0)
+        self.term = dr.sum(image.features * mi.TensorXf(error, image.features.shape), axis=None)
 
     def collect(self) -> None:
         """Update the scores from the gradients of a step."""
@@ -84,20 +88,11 @@ class Attribution:
             self._largest = dr.maximum(self._largest, dr.grad(self._probe).array)
             dr.eval(self._largest)
             self._probe = None
-            self._term = None
+            self.term = None
 
     def scores(self) -> np.ndarray:
         """Return the scores [N] of the steps so far."""
         return np.asarray(self._largest)
-
-
-def _typical(error: Float) -> Float:
-    """Return about the median of errors >= 0 that are not 0: the mean of those below twice the
-    mean.
-    """
-    mean = dr.sum(error) / dr.maximum(mi.Float(dr.count(error > 0)), 1)
-    small = (error > 0) & (error < 2 * mean)
-    return dr.sum(dr.select(small, error, 0)) / dr.maximum(mi.Float(dr.count(small)), 1)
 
 
 def densification_scores(
@@ -111,9 +106,8 @@ def densification_scores(
         targets: their images.
     """
     gaussians = gaussians.detached()
-    scores = np.zeros(len(gaussians), np.float32)
-    for view, target in zip(views, targets, strict=True):
-        scores = np.maximum(
-            scores, KeyImages({0: view}, {0: target}).sums(gaussians, ("error",))["error"][0]
-        )
-    return scores
+    errors = [
+        KeyImages({0: view}, {0: target}).sums(gaussians, ("error",))["error"][0]
+        for view, target in zip(views, targets, strict=True)
+    ]
+    return np.max(errors, axis=0)

@@ -1,4 +1,4 @@
-"""Random dropping of Gaussians."""
+"""Random dropout of Gaussians."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
-from morgs_mi.fit.dropping import adapted_to_images, default_dropping, dropped
+from morgs_mi.fit.dropout import adapted_to_images, dropped
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
@@ -54,36 +54,37 @@ def test_dropped__returns_the_same_without_probability():
     assert dropped(GAUSSIANS, 0.0, np.random.default_rng(0)) is GAUSSIANS
 
 
-def test_default_dropping__is_for_few_views_that_are_noisy_or_far_apart():
+def test_adapted_to_images__sets_a_dropout_for_few_views_that_are_noisy_or_far_apart():
     rng = np.random.default_rng(0)
 
-    def dropping(noise: float, degrees: float, times: int = 1) -> float:
+    def dropout(noise: float, degrees: float, times: int = 1) -> float:
         noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in times * GREY]
         cameras = look_at_cameras(arc(np.deg2rad(degrees) * np.arange(len(noisy)), 3.5), 40)
         images = [np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy]
         views = tuple(map(View, cameras, images))
-        return default_dropping(
-            FirstFrameProblem(GAUSSIANS, views, np.zeros((0, 3)), 3.0, RenderConfig())
-        )
+        few = FirstFrameProblem(GAUSSIANS, views, np.zeros((0, 3)), 3.0, RenderConfig())
+        adapted = adapted_to_images(FitConfig(), few).dropout
+        assert adapted is not None
+        return adapted
 
-    assert [dropping(noise, 8) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
-    assert [dropping(0.0, degrees) for degrees in (8, 40)] == [0, 0.2]
-    assert dropping(0.02, 40, times=2) == 0
+    assert [dropout(noise, 8) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
+    assert [dropout(0.0, degrees) for degrees in (8, 40)] == [0, 0.2]
+    assert dropout(0.02, 40, times=2) == 0
 
 
 @pytest.mark.parametrize("views", [1, 2, 4])
 @pytest.mark.parametrize(
-    ("noise", "dropping", "dssim_weight"), [(0.0, 0.0, 0.2), (0.008, 0.0, 0.2), (0.05, 0.2, 0.0)]
+    ("noise", "dropout", "dssim_weight"), [(0.0, 0.0, 0.2), (0.008, 0.0, 0.2), (0.05, 0.2, 0.0)]
 )
 def test_adapted_to_images__follows_the_noise(
-    views: int, noise: float, dropping: float, dssim_weight: float
+    views: int, noise: float, dropout: float, dssim_weight: float
 ):
     config = FitConfig(sh_degree=0)
     adapted = adapted_to_images(config, problem(bytes_of(GREY[:views], noise)))
     objective = replace(config.objective, dssim_weight=dssim_weight)
-    assert adapted == replace(config, dropping=dropping, objective=objective)
+    assert adapted == replace(config, dropout=dropout, objective=objective)
 
 
 def test_adapted_to_images__keeps_what_is_given():
-    config = FitConfig(dropping=0.1, noise_aware=False)
+    config = FitConfig(dropout=0.1, noise_aware=False)
     assert adapted_to_images(config, problem(bytes_of(GREY, 0.05))) == config

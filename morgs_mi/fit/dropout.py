@@ -1,4 +1,4 @@
-"""Random dropping of Gaussians, which improves novel views (DropGaussian, Park et al. 2025).
+"""Dropout of Gaussians, which improves novel views (DropGaussian, Park et al. 2025).
 
 Where training views are few or noisy, Gaussians overfit them together: one compensates for another
 in a single view. In every step of the first frame, each Gaussian is left out with probability p,
@@ -22,14 +22,14 @@ from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.noise import is_noisy
 from morgs_mi.fit.problem import FirstFrameProblem
 
-# Number of views that are fitted without dropping.
+# Number of views that are fitted without dropout.
 _MANY_VIEWS = 6
 # Logit of an opacity that no cut-off of the renderer lets pass.
 _INVISIBLE = -30.0
 # Largest opacity, which has a finite logit.
 _MOST = 0.999
 # Probability with which few views are fitted that are noisy or far apart.
-_DROPPING = 0.2
+_DROPOUT = 0.2
 # Least `Forecast.reach` of views that are far apart, degrees.
 _FAR = 24.0
 
@@ -52,24 +52,19 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
     return replace(gaussians, logit_opacities=mi.TensorXf(logits))
 
 
-def default_dropping(problem: FirstFrameProblem) -> float:
-    """Return the probability of dropping of a first frame: above 0 for few views that are noisy or
-    far apart.
-    """
-    if len(problem.views) >= _MANY_VIEWS:
-        return 0.0
-    far = len(problem.views) > 1 and forecast(problem.cameras, problem.points).reach >= _FAR
-    return _DROPPING if far or is_noisy(problem.images) else 0.0
-
-
 def adapted_to_images(config: FitConfig, problem: FirstFrameProblem) -> FitConfig:
-    """Return the settings of the first frame with what follows from its images: dropping, and the
+    """Return the settings of the first frame with what follows from its images: dropout, and the
     loss of noisy ones.
 
-    Noisy images are fitted by L1 alone if `noise_aware`. A dropping that is given stays.
+    Noisy images are fitted by L1 alone if `noise_aware`. Few views that are noisy or far apart are
+    fitted with dropout, unless it is given.
     """
-    if config.noise_aware and is_noisy(problem.images):
+    noisy = is_noisy([view.image for view in problem.views])
+    if config.noise_aware and noisy:
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
-    return (
-        replace(config, dropping=default_dropping(problem)) if config.dropping is None else config
-    )
+    if config.dropout is not None:
+        return config
+    views = len(problem.views)
+    few = views < _MANY_VIEWS
+    far = few and views > 1 and forecast(problem.cameras, problem.points).reach >= _FAR
+    return replace(config, dropout=_DROPOUT if few and (noisy or far) else 0.0)
