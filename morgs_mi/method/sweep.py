@@ -108,10 +108,11 @@ class KeyImages:
         color = color.reshape(A, height // factor, factor, width // factor, factor, 3).mean(
             axis=(2, 4)
         )
-        parts = zip(self.group.regions, self.group.split(color), strict=True)
+        regions = self.group.regions
+        parts = np.split(color, np.cumsum([region.num_blocks for region in regions])[:-1])
         return [
             region.uncropped(part)[: region.height // factor, : region.width // factor]
-            for region, part in parts
+            for region, part in zip(regions, parts, strict=True)
         ]
 
     def total_error(self, gaussians: Gaussians) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Tensor
+from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import touches
 from morgs_mi.render.projection import Splats, project
 from morgs_mi.render.rasterize import Image, rasterize
@@ -58,7 +59,7 @@ class ActiveView:
     @property
     def grid(self) -> BlockGrid:
         """All blocks of the view."""
-        return BlockGrid.of(self.camera.width, self.camera.height, self.config)
+        return BlockGrid(self.camera.width, self.camera.height, block_shape(self.config))
 
     def narrowed(self, blocks: np.ndarray) -> ActiveView | None:
         """Return the view restricted to some of its drawn blocks, bool [rows, columns]; None if

@@ -10,8 +10,7 @@ Therefore all recordings, and all derivatives that the package computes, hold `r
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import cache, partial, wraps
 from threading import RLock
@@ -62,8 +61,16 @@ def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
         # Python code, in which another thread can get the interpreter's lock and then wait for
         # Dr.Jit's: a deadlock.
         plain = [vars(a) if c else a for a, c in zip(arguments, classes, strict=True)]
-        with render_lock, _garbage_collection_off():
-            return _recording(function, mi.variant(), static, classes)(*plain)
+        with render_lock:
+            # An array that is collected while Dr.Jit inspects the arguments waits for Dr.Jit's lock
+            # forever.
+            collects = gc.isenabled()
+            gc.disable()
+            try:
+                return _recording(function, mi.variant(), static, classes)(*plain)
+            finally:
+                if collects:
+                    gc.enable()
 
     return call
 
@@ -91,18 +98,3 @@ def _rebuilt(
 ) -> Jit:
     """Return the result of `function` for arguments with their dataclasses converted to dicts."""
     return function(*static, *(c(**a) if c else a for a, c in zip(plain, classes, strict=True)))
-
-
-@contextmanager
-def _garbage_collection_off() -> Iterator[None]:
-    """Switch off Python's garbage collection inside the context.
-
-    An array that is collected while Dr.Jit inspects the arguments waits for Dr.Jit's lock forever.
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

@@ -86,7 +86,8 @@ class Splats:
 
         def columns_of(splats: Splats) -> tuple[Any, ...]:
             columns = tuple(
-                splats.channels.get(n) or _zeros(v, len(splats)) for n, v in self.channels.items()
+                splats.channels.get(n) or tuple(dr.zeros(mi.Float, len(splats)) for _ in v)
+                for n, v in self.channels.items()
             )
             bounds = splats.depths, splats.extent, splats.valid, splats.finite
             return (
@@ -102,10 +103,6 @@ class Splats:
         depths, extent, valid, finite = bounds
         view = None if self.view is None else view
         return Splats(shape, channels, depths, extent, valid, finite, profile, view)
-
-
-def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
-    return tuple(dr.zeros(mi.Float, count) for _ in columns)
 
 
 @dataclass(frozen=True)
@@ -127,15 +124,8 @@ def concatenated(a: Jit, b: Jit) -> Jit:
     """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for
     every length.
     """
-    return _joined(
-        a, b, dr.opaque(mi.UInt32, dr.width(a)), dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
-    )
-
-
-def _joined(a: Jit, b: Jit, count: UInt32, lane: UInt32) -> Jit:
-    # A recursive closure would be a cycle of references, whose arrays any thread may collect.
-    if isinstance(a, tuple):
-        return tuple(_joined(v, w, count, lane) for v, w in zip(a, b, strict=True))
+    count = dr.opaque(mi.UInt32, dr.width(a))
+    lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
     mode = dr.ReduceMode.NoConflicts
     first = lane < count
     front = dr.gather(type(a), a, lane, active=first, mode=mode)
@@ -238,11 +228,11 @@ def project(
         elif name == "depth":
             blended[name] = (z,)
         elif name in ("motion", "guided_motion"):
-            motion = (
-                gaussians.rows("motion", rows)
-                if name == "motion"
-                else _guided_motion(gaussians, rows)
-            )
+            motion = gaussians.rows("motion", rows)
+            if name == "guided_motion" and getattr(gaussians, "offset", None) is not None:
+                # Without the learned offset (eq. 8).
+                offset = gaussians.rows("offset", rows)
+                motion = [a - b for a, b in zip(motion, offset, strict=True)]
             blended[name] = _screen_motion(
                 motion, (x * rz, y * rz, z), (fx, fy), near, R, config.first_order_motion
             )
@@ -283,14 +273,6 @@ def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Fl
         for a, b, c, t in pose
     )
     return x, y, z
-
-
-def _guided_motion(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
-    """Return the guided motion of Gaussians: their motion without the learned offset (eq. 8)."""
-    motion = gaussians.rows("motion", rows)
-    if getattr(gaussians, "offset", None) is None:
-        return motion
-    return [a - b for a, b in zip(motion, gaussians.rows("offset", rows), strict=True)]
 
 
 def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
@@ -343,14 +325,13 @@ def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
 def _numbers_of(camera: Camera) -> list[float]:
     """Return the numbers that `_intrinsics` describes."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2]
-    bounds = [*_bounds(fx, cx, camera.width), *_bounds(fy, cy, camera.height)]
+    # Up to which the projection is linearised: 30 % of the half view on every side.
+    bounds = [
+        bound
+        for f, c, size in ((fx, cx, camera.width), (fy, cy, camera.height))
+        for bound in (-c / f - 0.15 * size / f, (size - c) / f + 0.15 * size / f)
+    ]
     return [fx, fy, cx, cy, camera.near, *bounds, camera.delay, camera.readout, camera.height]
-
-
-def _bounds(f: float, c: float, size: int) -> tuple[float, float]:
-    """Return the bounds of x/z or y/z up to which the projection is linearised."""
-    margin = 0.15 * size / f  # 30 % of the half view on every side
-    return -c / f - margin, (size - c) / f + margin
 
 
 def _rotation(quats: Jit) -> list[Jit]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from math import prod
 from typing import Any
@@ -88,12 +88,6 @@ class Image:
         color = np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)
         return png_bytes(np.rint(255 * color).astype(np.uint8))
 
-    @staticmethod
-    def _of(tensors: Mapping[str, Tensor]) -> Image:
-        others = dict(tensors)
-        channels = {f.name: others.pop(f.name) for f in fields(Image) if f.name in others}
-        return Image(**channels, others=others)
-
 
 @with_render_lock
 def rasterize(
@@ -165,39 +159,25 @@ def rasterize(
     config = RenderConfig() if config is None else config
     is_stack = isinstance(camera, Sequence)
     cameras = tuple(camera) if is_stack else (camera,)
-    _check_gaussians(gaussians, channels, detach_weights)
-    _check_cameras(cameras)
-    _check_background(background)
-    check_type("rasterize()", "config", config, RenderConfig)
-    for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
-        if value is not None:
-            check_type("rasterize()", name, value, kind)
+    options = {"background": background, "features": features, "config": config}
     of_one_view = {"region": region, "static_splats": static_splats, "depth_limit": depth_limit}
-    for name, value in of_one_view.items():
-        if is_stack and value is not None:
-            raise ValueError(
-                f"rasterize(): `{name}` must be None with a sequence of cameras, got a "
-                f"{type(value).__name__}; render one camera at a time."
-            )
+    for problem in _problems(
+        gaussians, cameras, channels, detach_weights, options, of_one_view, is_stack
+    ):
+        raise ValueError(f"rasterize(): {problem}.")
     channels = tuple(dict.fromkeys(channels))
     sizes = {**channel_sizes(), "alpha": 1}
     view = cameras[0]
     if features is not None:
-        features, sizes["features"] = _checked_features(features, gaussians)
+        features = float_tensor("rasterize()", "features", features)
+        sizes["features"] = int(features.shape[1])
         channels = (*channels, "features")
-    limits = None if depth_limit is None else _checked_limits(depth_limit, view, static_splats)
+    limits = None
+    if depth_limit is not None:  # finite: a limit at infinity is one beyond all Gaussians
+        depths = float_tensor("rasterize()", "depth_limit", depth_limit)
+        limits = dr.clip(depths.array, -FARTHEST, FARTHEST)
     if region is None:
-        region = full_view(view.width, view.height, config, len(cameras))
-    else:
-        block = block_shape(config)
-        shape = (region.width, region.height, *region.block)
-        if shape != (view.width, view.height, *block):
-            raise ValueError(
-                f"rasterize(): `region` must be of a {view.width}x{view.height} view with "
-                f"{block[0]}x{block[1]} blocks like the camera's and the config's, got "
-                f"{shape[0]}x{shape[1]} with {shape[2]}x{shape[3]}; build it for this camera with "
-                "this config."
-            )
+        region = full_view(view.width, view.height, block_shape(config), len(cameras), mi.variant())
     stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
@@ -240,9 +220,14 @@ def rasterize(
                 images[name] = dr.select(weight > 0, images[name] / dr.maximum(weight, 1e-8), 0)
             else:
                 images[name] = _over(background, images[name], weight)
-    return Image._of(
-        {name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels}
-    )
+    return _image({name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels})
+
+
+def _image(tensors: Mapping[str, Tensor]) -> Image:
+    """Return the image with these tensors, by the names of their channels."""
+    others = dict(tensors)
+    channels = {f.name: others.pop(f.name) for f in fields(Image) if f.name in others}
+    return Image(**channels, others=others)
 
 
 def _reads_weight(channel: str, background: Sequence[float] | Jit | None) -> bool:
@@ -334,126 +319,139 @@ def _empty(
     if background is not None and "color" in images:
         zeros = dr.zeros(mi.Float, prod((*shape, 3)))
         images["color"] = _tensor(_over(background, zeros, zeros), region, (*shape, 3))
-    return Image._of(images)
+    return _image(images)
 
 
-def _check_gaussians(
-    gaussians: ActivatedGaussians, channels: Sequence[str], detach_weights: Sequence[str]
-) -> None:
-    """Raise an error if these are not Gaussians with the attributes of the channels, or the variant
-    has no derivatives.
+def _problems(
+    gaussians: ActivatedGaussians,
+    cameras: Sequence[Camera],
+    channels: Sequence[str],
+    detach_weights: Sequence[str],
+    options: Mapping[str, Any],
+    of_one_view: Mapping[str, Any],
+    is_stack: bool,
+) -> Iterator[str]:
+    """Yield a sentence for each argument of `rasterize` that is refused; a later one relies on the
+    earlier ones.
+
+    Args:
+        gaussians: as for `rasterize`, like `channels` and `detach_weights`.
+        cameras: the view, or all of them.
+        channels: to render.
+        detach_weights: channels.
+        options: background, features and config.
+        of_one_view: region, static splats and depth limit, which several cameras cannot have.
+        is_stack: whether a sequence of cameras was given.
     """
     if not hasattr(gaussians, "means"):
-        raise ValueError(
-            f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass "
-            "some."
-        )
+        yield f"`gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some"
     for name, names in (("channels", channels), ("detach_weights", detach_weights)):
         if isinstance(names, str) or not isinstance(names, Sequence):
-            raise ValueError(
-                f"rasterize(): `{name}` must be a sequence of names, got {names!r}; pass a tuple."
-            )
+            yield f"`{name}` must be a sequence of names, got {names!r}; pass a tuple"
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not dr.is_diff_v(mi.Float):
-        raise ValueError(
-            f"rasterize(): expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', "
-            f"got {mi.variant()!r}; call mi.set_variant() first."
+        yield (
+            "expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got "
+            f"{mi.variant()!r}; call mi.set_variant() first"
         )
-    choices = ("color", "alpha", "depth", "motion", "guided_motion", *attribute_channels())
+    attributes = attribute_channels()
+    choices = ("color", "alpha", "depth", "motion", "guided_motion", *attributes)
     for name in (*channels, *detach_weights):
         if name not in choices and not (name == "features" and name not in channels):
-            raise ValueError(
-                f"rasterize(): `channels` must be out of {', '.join(choices)}, got {name!r}; use "
-                "one of these, or pass other values as `features`."
+            yield (
+                f"`channels` must be out of {', '.join(choices)}, got {name!r}; use one of these, "
+                "or pass other values as `features`"
             )
     motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
-    for name, attribute in {**motions, **attribute_channels()}.items():
+    for name, attribute in {**motions, **attributes}.items():
         if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
-            raise ValueError(
-                f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got "
-                "none; set it or remove the channel."
+            yield (
+                f"channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or "
+                "remove the channel"
             )
 
-
-def _check_cameras(cameras: Sequence[Camera]) -> None:
-    """Raise an error if these are not one or more cameras of the same size, with images that have
-    too many pixels, or do not fit in memory.
-    """
     if not cameras:
-        raise ValueError(
-            "rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one."
-        )
+        yield "`camera` must be one or more cameras, got an empty sequence; pass one"
     for camera in cameras:
         check_type("rasterize()", "camera", camera, Camera, OF_SENSOR)
+    view = cameras[0]
+    V = len(cameras)
     sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras))
     if len(sizes) > 1:
-        raise ValueError(
-            f"rasterize(): `camera` must be cameras of the same size, got "
-            f"{' and '.join(sizes[:2])}; render one camera at a time."
+        yield (
+            f"`camera` must be cameras of the same size, got {' and '.join(sizes[:2])}; render one "
+            "camera at a time"
         )
-    V = len(cameras)
-    pixels = V * cameras[0].width * cameras[0].height
+    pixels = V * view.width * view.height
     if pixels > 2**28:
-        raise ValueError(
-            f"rasterize(): the image must have at most 2^28 pixels, got "
-            f"{sizes[0] if V == 1 else f'{V} times {sizes[0]}'}; render it in tiles, one camera "
-            "each."
+        yield (
+            f"the image must have at most 2^28 pixels, got {'' if V == 1 else f'{V} times '}"
+            f"{sizes[0]}; render it in tiles, one camera each"
         )
     if pixels >= _LARGE:
         images = f"{'an image' if V == 1 else f'{V} images'} of {sizes[0]} pixels"
         remedy = "render a smaller one, or tiles, one camera each"
         check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
-
-def _check_background(background: Sequence[float] | Jit | None) -> None:
+    background = options["background"]
     behind = np.asarray(dr.detach(background)).ravel() if dr.is_array_v(background) else background
     if behind is not None and not (
         np.shape(behind) == (3,)
         and (np.abs(numbers("rasterize()", "background", behind)) <= FARTHEST).all()
     ):
-        raise ValueError(
-            "rasterize(): `background` must be three finite numbers of at most 1e18, got "
-            f"{background!r}; pass a colour or None."
+        yield (
+            "`background` must be three finite numbers of at most 1e18, got "
+            f"{background!r}; pass a colour or None"
         )
-
-
-def _checked_features(
-    features: Tensor | np.ndarray, gaussians: ActivatedGaussians
-) -> tuple[Tensor, int]:
-    """Return the features as a tensor [N, F], and F."""
-    features = float_tensor("rasterize()", "features", features)
-    shape = tuple(features.shape)
-    N = int(gaussians.means.shape[0])
-    if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
-        raise ValueError(
-            f"rasterize(): `features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, "
-            f"got {list(shape)}; blend more in several calls."
-        )
-    return features, shape[1]
-
-
-def _checked_limits(
-    depth_limit: Tensor | np.ndarray, camera: Camera, static_splats: Splats | None
-) -> Float:
-    """Return the depth limits [H W], finite: a limit at infinity is one beyond all Gaussians."""
-    limits: Tensor = float_tensor("rasterize()", "depth_limit", depth_limit)
-    expected = (camera.height, camera.width)
-    if tuple(limits.shape) != expected or dr.any(dr.isnan(limits.array)):
-        problem = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
-        raise ValueError(
-            f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got "
-            f"{problem}; use inf where there is no surface."
-        )
-    if static_splats is not None:
-        raise ValueError(
-            "rasterize(): `depth_limit` must be None where `static_splats` are given, got both; "
-            "their depth along a ray is not stored."
-        )
-    if dr.grad_enabled(limits):
-        raise ValueError(
-            "rasterize(): `depth_limit` must not be attached to a gradient graph, because it gets "
-            "no gradient, got one with gradients enabled; pass dr.detach(depth_limit)."
-        )
-    return dr.clip(limits.array, -FARTHEST, FARTHEST)
+    config = options["config"]
+    check_type("rasterize()", "config", config, RenderConfig)
+    region, static_splats, depth_limit = (
+        of_one_view[name] for name in ("region", "static_splats", "depth_limit")
+    )
+    for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
+        if value is not None:
+            check_type("rasterize()", name, value, kind)
+    for name, value in of_one_view.items():
+        if is_stack and value is not None:
+            yield (
+                f"`{name}` must be None with a sequence of cameras, got a {type(value).__name__}; "
+                "render one camera at a time"
+            )
+    if options["features"] is not None:
+        shape = tuple(float_tensor("rasterize()", "features", options["features"]).shape)
+        N = int(gaussians.means.shape[0])
+        if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
+            yield (
+                f"`features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, got "
+                f"{list(shape)}; blend more in several calls"
+            )
+    if depth_limit is not None:
+        limits: Tensor = float_tensor("rasterize()", "depth_limit", depth_limit)
+        expected = (view.height, view.width)
+        if tuple(limits.shape) != expected or dr.any(dr.isnan(limits.array)):
+            problem = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
+            yield (
+                f"`depth_limit` must be one depth per pixel, {list(expected)}, got {problem}; use "
+                "inf where there is no surface"
+            )
+        if static_splats is not None:
+            yield (
+                "`depth_limit` must be None where `static_splats` are given, got both; their depth "
+                "along a ray is not stored"
+            )
+        if dr.grad_enabled(limits):
+            yield (
+                "`depth_limit` must not be attached to a gradient graph, because it gets no "
+                "gradient, got one with gradients enabled; pass dr.detach(depth_limit)"
+            )
+    if region is not None:
+        block = block_shape(config)
+        shape = (region.width, region.height, *region.block)
+        if shape != (view.width, view.height, *block):
+            yield (
+                f"`region` must be of a {view.width}x{view.height} view with {block[0]}x{block[1]} "
+                f"blocks like the camera's and the config's, got {shape[0]}x{shape[1]} with "
+                f"{shape[2]}x{shape[3]}; build it for this camera with this config"
+            )
 
 
 def _check_finite(
@@ -467,31 +465,26 @@ def _check_finite(
     """
     if dr.all(finite):
         return
-    for camera in cameras:
-        _check_numbers("camera.viewmat", camera.viewmat)
-    for name in ("means", "scales", "quats", "opacities"):
-        _check_numbers(name, getattr(gaussians, name, None))
     others = [attribute.activated_name for attribute in attribute_channels().values()]
-    for name in ("sh_coeffs", "motion", *others):
-        _check_numbers(name, getattr(gaussians, name, None), FARTHEST)
-    _check_numbers("features", features, FARTHEST)
-
-
-def _check_numbers(name: str, value: Tensor | None, most: float = np.inf) -> None:
-    """Raise an error if a value is not finite, or above `most`."""
-    if value is None:
-        return
-    array = np.asarray(dr.detach(value))
-    bad = np.argwhere(~(np.isfinite(array) & (np.abs(array) <= most)))
-    if len(bad):
-        worst = array[tuple(bad[0])]
-        index = ", ".join(map(str, bad[0]))
-        remedy = (
-            "lower the learning rate"
-            if name == "camera.viewmat"
-            else "remove these Gaussians or lower the learning rate"
-        )
-        raise ValueError(
-            f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, "
-            f"got {worst:g} at [{index}] ({len(bad)} such values); {remedy}."
-        )
+    blended_names = ("sh_coeffs", "motion", *others)
+    names = ("means", "scales", "quats", "opacities", *blended_names)
+    values = [
+        *(("camera.viewmat", camera.viewmat) for camera in cameras),
+        *((name, getattr(gaussians, name, None)) for name in names),
+        ("features", features),
+    ]
+    for name, value in values:
+        if value is None:
+            continue
+        most = FARTHEST if name in (*blended_names, "features") else np.inf
+        array = np.asarray(dr.detach(value))
+        bad = np.argwhere(~(np.isfinite(array) & (np.abs(array) <= most)))
+        if len(bad):
+            worst = array[tuple(bad[0])]
+            limit = "at most 1e18" if np.isfinite(worst) else "finite"
+            index = ", ".join(map(str, bad[0]))
+            remedy = "" if name == "camera.viewmat" else "remove these Gaussians or "
+            raise ValueError(
+                f"rasterize(): `{name}` must be {limit}, got {worst:g} at [{index}] ({len(bad)} "
+                f"such values); {remedy}lower the learning rate."
+            )

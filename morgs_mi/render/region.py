@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import gcd
-from typing import Any
 
 import cv2
 import drjit as dr
@@ -40,13 +38,6 @@ class BlockGrid:
     height: int  #: Height of the view in pixels.
     block: tuple[int, int]  #: (width, height) of a block in pixels.
 
-    @classmethod
-    def of(cls, width: int, height: int, config: RenderConfig) -> BlockGrid:
-        """Return the blocks of a view of that size, in pixels, with the block shape of a
-        configuration.
-        """
-        return cls(width, height, block_shape(config))
-
     @property
     def tiles(self) -> tuple[int, int]:
         """Number of tiles across and down."""
@@ -58,32 +49,14 @@ class BlockGrid:
         across, down = self.tiles
         return down * DOWN, across * ACROSS
 
-    def covering(self, mask: np.ndarray) -> np.ndarray:
-        """Return the blocks with a pixel of a mask [H, W], bool [rows, columns]."""
-        # Several pixels of a row as one integer: NumPy reduces a few small groups of booleans 50
-        # times more slowly.
-        word = gcd(self.block[0], 8)
-        pixels = self._padded(mask).reshape(self.shape[0], self.block[1], -1)
-        rows = np.bitwise_or.reduce(pixels.view(f"u{word}"), axis=1)
-        return rows.reshape(*self.shape, self.block[0] // word).any(axis=2)
-
     def counts(self, mask: np.ndarray) -> np.ndarray:
         """Return the number of pixels of a mask [H, W] in each block, int32 [rows, columns]."""
         rows, columns = self.shape
         width, height = self.block
-        pixels = self._padded(mask).view(np.uint8)
-        shares = cv2.resize(
-            pixels.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA
-        )
-        return np.rint(shares * (width * height)).astype(np.int32)
-
-    def _padded(self, mask: np.ndarray) -> np.ndarray:
-        """Return a mask [H, W] with rows and columns of False up to whole tiles."""
-        rows, columns = self.shape
-        width, height = self.block
-        pixels = np.zeros((rows * height, columns * width), bool)
+        pixels = np.zeros((rows * height, columns * width), np.float32)
         pixels[: self.height, : self.width] = mask
-        return pixels
+        shares = cv2.resize(pixels, (columns, rows), interpolation=cv2.INTER_AREA)
+        return np.rint(shares * (width * height)).astype(np.int32)
 
 
 class Region:
@@ -117,8 +90,8 @@ class Region:
                 "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
                 f"{description}; skip a view in which nothing is drawn."
             )
-        grid = BlockGrid.of(mask.shape[1], mask.shape[0], config or RenderConfig())
-        self._build(grid, grid.covering(mask))
+        grid = BlockGrid(mask.shape[1], mask.shape[0], block_shape(config or RenderConfig()))
+        self._build(grid, grid.counts(mask) > 0)
 
     @classmethod
     def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> Region:
@@ -163,8 +136,8 @@ class Region:
         self.height = views * grid.height
         self.across, self.down = grid.tiles
         self._lay_out(np.tile(blocks, (views, 1)))
-        mask = None if whole else self.inside()
-        self.weights = None if mask is None or mask.all() else from_numpy(mi.Float, mask)
+        mask = np.ones((), bool) if whole else self.crop(np.ones((self.height, self.width), bool))
+        self.weights = None if mask.all() else from_numpy(mi.Float, mask)
 
     def _lay_out(self, blocks: np.ndarray) -> None:
         """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows
@@ -183,25 +156,6 @@ class Region:
         self._blocks = (row, column)
         self.num_blocks = len(row)
         self.num_tiles = len(tiles)
-        arrays = {
-            "tile": tile,
-            "bit": bit,
-            **self._pixels(row, column),
-            "tile_grid": [self.across, self.down],
-            "slot_of": slots,
-            "block_table": summed_area(blocks),
-            "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
-        }
-        for name, values in arrays.items():
-            setattr(self, name, from_numpy(mi.UInt32, values))
-        self.corner_x = from_numpy(mi.Float, tiles % self.across * (ACROSS * bw))
-        self.corner_y = from_numpy(mi.Float, tiles // self.across % self.down * (DOWN * bh))
-
-    def _pixels(self, row: np.ndarray, column: np.ndarray) -> dict[str, Any]:
-        """Return where the pixels of each block are, in its view and in memory; set the pitch `row`
-        and the number of pixels.
-        """
-        bw, bh = self.block
         view, row_in_view = np.divmod(row, self.down * DOWN)
         x = column * bw
         y = row_in_view * bh
@@ -216,8 +170,24 @@ class Region:
             self.num_pixels = len(x) * bw * bh
             place = np.arange(len(x)) * (bw * bh)
             rows = np.full(len(y), bh)
-        # Pixels are read and written in packets of 4 floats: places and pitch count packets.
-        return {"x": x, "y": y, "place": place // 4, "pitch": [self.row // 4], "rows": rows}
+        arrays = {
+            "tile": tile,
+            "bit": bit,
+            "x": x,
+            "y": y,
+            # Pixels are read and written in packets of 4 floats: place and pitch count packets.
+            "place": place // 4,
+            "pitch": [self.row // 4],
+            "rows": rows,
+            "tile_grid": [self.across, self.down],
+            "slot_of": slots,
+            "block_table": summed_area(blocks),
+            "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
+        }
+        for name, values in arrays.items():
+            setattr(self, name, from_numpy(mi.UInt32, values))
+        self.corner_x = from_numpy(mi.Float, tiles % self.across * (ACROSS * bw))
+        self.corner_y = from_numpy(mi.Float, tiles // self.across % self.down * (DOWN * bh))
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of an image with `channels` floats per pixel on this region."""
@@ -230,14 +200,6 @@ class Region:
         """The drawn pixels, bool [H, W]."""
         width, height = self.block
         return self.drawn.repeat(height, axis=0).repeat(width, axis=1)[: self.height, : self.width]
-
-    def inside(self) -> np.ndarray:
-        """Return the mask of the pixels that lie in the view, bool [A, block_height, block_width].
-
-        If the size of the view is not a multiple of the block, pixels of the last blocks lie
-        outside the view.
-        """
-        return self.crop(np.ones((self.height, self.width), bool))
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...],
@@ -282,23 +244,18 @@ class Region:
         rows, columns = self.drawn.shape
         blocks = np.zeros((rows, height, columns, width, *rest), values.dtype)
         blocks[row, :, column] = values
-        return _as_image(blocks)
+        return blocks.reshape(rows * height, columns * width, *rest)
 
     def paste(self, values: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Return a copy of an image [H, W, ...] with this region's pixels replaced by `values`."""
         row, column = self._blocks
         rows, columns = self.drawn.shape
         width, height = self.block
-        blocks = _with_zeros(image, rows * height, columns * width)
-        blocks = blocks.reshape(rows, height, columns, width, *image.shape[2:])
+        whole = np.zeros((rows * height, columns * width, *image.shape[2:]), image.dtype)
+        whole[: self.height, : self.width] = image
+        blocks = whole.reshape(rows, height, columns, width, *image.shape[2:])
         blocks[row, :, column] = values
-        return _as_image(blocks)[: self.height, : self.width]
-
-
-def _as_image(blocks: np.ndarray) -> np.ndarray:
-    """Return blocks [rows, height, columns, width, ...] as an image."""
-    rows, height, columns, width, *rest = blocks.shape
-    return blocks.reshape(rows * height, columns * width, *rest)
+        return whole[: self.height, : self.width]
 
 
 def joined(regions: Sequence[Region]) -> Region:
@@ -318,17 +275,13 @@ def joined(regions: Sequence[Region]) -> Region:
     columns = region.across * ACROSS
     region.width = columns * region.block[0]
     region.height = len(regions) * rows * region.block[1]
-    blocks = [_with_zeros(grid, rows, columns) for grid in grids]
+    blocks = [
+        np.pad(grid, ((0, rows - grid.shape[0]), (0, columns - grid.shape[1]))) for grid in grids
+    ]
     region._lay_out(np.concatenate(blocks))
-    mask = np.concatenate([part.inside() for part in regions])
+    mask = np.concatenate([part.crop(np.ones((part.height, part.width), bool)) for part in regions])
     region.weights = None if mask.all() else from_numpy(mi.Float, mask)
     return region
-
-
-def _with_zeros(grid: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Return an array with zeros up to a number of rows and columns."""
-    missing = [(0, rows - grid.shape[0]), (0, columns - grid.shape[1])]
-    return np.pad(grid, missing + [(0, 0)] * (grid.ndim - 2))
 
 
 def summed_area(grid: np.ndarray) -> np.ndarray:
@@ -366,16 +319,20 @@ def on_region(values: Float, region: Region) -> Float:
     return image
 
 
-def full_view(width: int, height: int, config: RenderConfig, views: int = 1) -> Region:
+@lru_cache(maxsize=8)
+def full_view(
+    width: int, height: int, block: tuple[int, int], views: int, variant: str | None
+) -> Region:
     """Return the region of all blocks of equal views, one below the other; its images are
     [views * H, W, C].
+
+    Args:
+        width: width of a view in pixels.
+        height: height of a view in pixels.
+        block: (width, height) of a block in pixels.
+        views: number of views.
+        variant: the active one.
     """
-    return _whole_view(width, height, block_shape(config), views, mi.variant())
-
-
-@lru_cache(maxsize=8)
-def _whole_view(
-    width: int, height: int, block: tuple[int, int], views: int, variant: str
-) -> Region:
     grid = BlockGrid(width, height, block)
-    return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True, views=views)
+    blocks = grid.counts(np.ones((height, width), bool)) > 0
+    return Region.of(grid, blocks, whole=True, views=views)

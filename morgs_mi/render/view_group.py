@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +25,6 @@ from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import Splats, Views, project
 from morgs_mi.render.region import Region, joined, quotient
-from morgs_mi.render.render_config import RenderConfig
 
 
 class ViewGroup:
@@ -42,6 +40,7 @@ class ViewGroup:
         views: the views.
         regions: their regions.
         region: the blocks of all of them, see `joined`.
+        config: cut-offs and block shape.
     """
 
     def __init__(self, views: Sequence[ActiveView]) -> None:
@@ -52,22 +51,13 @@ class ViewGroup:
             for view in views
         )
         self.region = joined(self.regions)
-
-    @property
-    def config(self) -> RenderConfig:
-        """Cut-offs and block shape."""
-        return self.views[0].config
+        self.config = self.views[0].config
 
     def crop(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return an image of the group from one image [H, W, ...] per view."""
         return np.concatenate(
             [region.crop(image) for region, image in zip(self.regions, images, strict=True)]
         )
-
-    def split(self, image: np.ndarray) -> list[np.ndarray]:
-        """Return the image of each view on its region from an image of the group."""
-        ends = np.cumsum([region.num_blocks for region in self.regions])
-        return np.split(image, ends[:-1])
 
     @with_render_lock
     def draw(self, gaussians: ActivatedGaussians) -> Drawing:
@@ -114,17 +104,13 @@ class ViewGroup:
         rows = dr.compress(touches(splats, self.region))
         if not dr.width(rows):
             return None
-        at = partial(_gathered, rows)
-        return replace(
-            splats,
-            shape=at(splats.shape),
-            channels={"color": at(splats.channels["color"])},
-            depths=at(splats.depths),
-            extent=at(splats.extent),
-            valid=at(splats.valid),
-            finite=at(splats.finite),
-            view=at(splats.view),
-        )
+        at = {
+            name: dr.gather(type(value), value, rows)
+            for name, value in vars(splats).items()
+            if name not in ("channels", "profile")
+        }
+        color = dr.gather(tuple, splats.channels["color"], rows)
+        return replace(splats, **at, channels={"color": color})
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +223,3 @@ def _num_channels(image: np.ndarray, size: tuple[int, ...]) -> int:
             f"{list(np.shape(image))}; resize it to the camera, or crop it to the region."
         )
     return C
-
-
-def _gathered(rows: UInt32, values: Any) -> Any:
-    """Return an array, or each of a tuple of arrays, at `rows`."""
-    # A recursive closure would be a cycle of references, whose arrays any thread may collect.
-    if isinstance(values, tuple):
-        return tuple(_gathered(rows, v) for v in values)
-    return dr.gather(type(values), values, rows)

@@ -6,6 +6,7 @@ Mitsuba has a base class for every variant, so this module is imported again aft
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -59,34 +60,69 @@ class _SceneGaussians:
         return tensor_rows(getattr(self, name), index)
 
 
-def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> _SceneGaussians:
+def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
     """Return the Gaussians of all shapes, padded with zeros to the largest number of SH
     coefficients.
     """
-    shapes = _ellipsoids(scene)
-    for shape in scene.shapes():
-        if not (with_surfaces or shape.is_ellipsoids()):
-            raise ValueError(
-                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} "
-                f"{shape.id()!r}; remove it from the scene, or set `surfaces` to an integrator "
-                "that renders it, such as `path`."
-            )
-    if not shapes:
-        raise ValueError(
-            "gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one."
-        )
-    parts = [_shape_gaussians(shape, attributes) for shape in shapes]
+    parts = [_shape_gaussians(shape, attributes) for shape in _ellipsoids(scene)]
     K = max(part["sh_coeffs"].shape[1] for part in parts)
     for part in parts:
         N, present, _ = part["sh_coeffs"].shape
         if present < K:
             zeros = dr.zeros(mi.TensorXf, (N, K - present, 3))
             part["sh_coeffs"] = dr.concat([part["sh_coeffs"], zeros], axis=1)
-    if len(parts) == 1:
-        return _SceneGaussians(parts[0])
-    return _SceneGaussians(
-        {name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}
-    )
+    if len(parts) > 1:
+        parts = [{name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}]
+    return _SceneGaussians(parts[0])
+
+
+def _property_problems(background: Any, aovs: list[str], surfaces: Any) -> Iterator[str]:
+    """Yield a sentence for each property of the plugin that is refused."""
+    values = np.ravel(background)
+    if background is not None and (
+        values.size not in (1, 3) or values.dtype.kind not in "fiu" or not bounded(values)
+    ):
+        yield (
+            f"`background` must be one or three finite numbers, got a {type(background).__name__}, "
+            f"{str(background)[:20]!r}; pass a colour such as {{'type': 'rgb', 'value': 1}}"
+        )
+    if surfaces is not None and (
+        not isinstance(surfaces, mi.Integrator) or isinstance(surfaces, GaussianSplatIntegrator)
+    ):
+        yield (
+            "`surfaces` must be an integrator of surfaces such as {'type': 'path'}, got "
+            f"{surfaces!r}; pass another one"
+        )
+    if surfaces is not None and not mi.is_rgb:
+        yield (
+            f"with `surfaces`, expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; "
+            "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours"
+        )
+    names = aov_attributes()
+    for name in aovs:
+        if name not in names:
+            yield f"`aovs` must be out of {', '.join(names)}, got {name!r}; separate them by commas"
+
+
+def _scene_problems(
+    scene: Any, film: Any, num_views: int, border: int, with_surfaces: bool
+) -> Iterator[str]:
+    """Yield a sentence for each part of a scene that cannot be rendered."""
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        name = film.class_name()
+        yield f"expected an `hdrfilm`, got {name}; replace it, because only RGB is drawn"
+    if num_views > 1 and (border or with_surfaces):
+        reason = "`sample_border` in its film" if border else "`surfaces`"
+        yield f"expected a `batch` sensor without {reason}; render its sensors one by one"
+    for shape in scene.shapes():
+        if not (with_surfaces or shape.is_ellipsoids()):
+            yield (
+                f"expected `ellipsoids` shapes only, got {shape.class_name()} {shape.id()!r}; "
+                "remove it from the scene, or set `surfaces` to an integrator that renders it, "
+                "such as `path`"
+            )
+    if not _ellipsoids(scene):
+        yield "expected a scene with an `ellipsoids` shape, got none; add one"
 
 
 def _ellipsoids(scene: Any) -> list[Any]:
@@ -253,43 +289,18 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             self.config = RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
         except ValueError as error:
             raise ValueError(f"gaussian_splat: {error}") from None
-        self.background = None
-        background = props.get("background", None)
-        if background is not None:
-            values = np.ravel(background)
-            if values.size not in (1, 3) or values.dtype.kind not in "fiu" or not bounded(values):
-                raise ValueError(
-                    "gaussian_splat: `background` must be one or three finite numbers, got a "
-                    f"{type(background).__name__}, {str(background)[:20]!r}; pass a colour such "
-                    "as {'type': 'rgb', 'value': 1}."
-                )
-            self.background = mi.Color3f(np.broadcast_to(values.astype(float), 3))
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
         self.surfaces = props.get("surfaces", None)
-        if self.surfaces is not None:
-            if not isinstance(self.surfaces, mi.Integrator) or isinstance(
-                self.surfaces, GaussianSplatIntegrator
-            ):
-                raise ValueError(
-                    "gaussian_splat: `surfaces` must be an integrator of surfaces such as "
-                    f"{{'type': 'path'}}, got {self.surfaces!r}; pass another one."
-                )
-            if not mi.is_rgb:
-                raise ValueError(
-                    "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', "
-                    f"got {mi.variant()!r}; call mi.set_variant() before the scene is loaded, "
-                    "because Gaussians have RGB colours."
-                )
+        background = props.get("background", None)
+        for problem in _property_problems(background, self.aovs, self.surfaces):
+            raise ValueError(f"gaussian_splat: {problem}.")
+        self.background = None
+        if background is not None:
+            values = np.ravel(background).astype(float)
+            self.background = mi.Color3f(np.broadcast_to(values, 3))
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
-        names = aov_attributes()
-        for name in self.aovs:
-            if name not in names:
-                raise ValueError(
-                    f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; "
-                    "separate them by commas."
-                )
 
     def traverse(self, callback: Any) -> None:
         if self.background is not None:
@@ -382,24 +393,15 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         """
         sensor = _sensor_of(scene, sensor)
         film = sensor.film()
-        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            raise ValueError(
-                f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, "
-                "because only RGB is drawn."
-            )
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
-        if len(views) > 1 and (border or self.surfaces is not None):
-            reason = "`sample_border` in its film" if border else "`surfaces`"
-            raise ValueError(
-                f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors "
-                "one by one."
-            )
+        for problem in _scene_problems(scene, film, len(views), border, self.surfaces is not None):
+            raise ValueError(f"gaussian_splat: {problem}.")
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         required = (aov_attributes()[name] for name in self.aovs)
         attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
-        gaussians = _scene_gaussians(scene, attributes, self.surfaces is not None)
+        gaussians = _scene_gaussians(scene, attributes)
         channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
         # Cropped after rendering: the projection's linearisation depends on the extent of the whole
         # view.

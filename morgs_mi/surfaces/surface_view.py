@@ -71,23 +71,25 @@ def surface_scene(scene: Any) -> Any:
     surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not surfaces and scene.environment() is None:
         return None
+    problem = ""
     if not scene.emitters():
-        raise ValueError(
-            "gaussian_splat: expected an emitter that lights the surfaces, got none; add one to "
-            "the scene, such as an `envmap` of morgs_mi.light_probe()."
+        problem = (
+            "expected an emitter that lights the surfaces, got none; add one to the scene, such as "
+            "an `envmap` of morgs_mi.light_probe()"
         )
     for shape in surfaces:
+        name = f"{shape.class_name()} {shape.id()!r}"
         if shape.is_medium_transition():
-            raise ValueError(
-                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the "
-                "boundary of a medium; remove the medium, because splats have no place in the "
-                "order of a volume's light."
+            problem = problem or (
+                f"expected surfaces, got {name}, the boundary of a medium; remove the medium, "
+                "because splats have no place in the order of a volume's light"
             )
-        if shape.bsdf() is None:
-            raise ValueError(
-                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got "
-                "none; set `bsdf` where the shape is defined."
+        elif shape.bsdf() is None:
+            problem = problem or (
+                f"the {name} must have a BSDF, got none; set `bsdf` where the shape is defined"
             )
+    if problem:
+        raise ValueError(f"gaussian_splat: {problem}.")
     return shared_scene([*surfaces, *lights(scene)], scene)
 
 

@@ -167,7 +167,9 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
     truth = np.float32(rng.uniform(size=(height, width, 3)))
     changed = (
         region.crop(truth)
-        + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+        + np.float32(rng.normal(size=region.shape(3)))
+        * region.crop(np.ones((region.height, region.width), bool))[..., None]
+        * 0.1
     )
     new_image = region.paste(changed, truth)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)

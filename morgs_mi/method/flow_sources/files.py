@@ -19,7 +19,6 @@ and y of every pixel row by row as float32, all little-endian. An EXR file holds
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,26 +75,26 @@ class FlowFolder:
             FileNotFoundError: a file or its folder is missing.
             ValueError: a frame has two files, a flow has another size, or as `read_flow`.
         """
-        back = self._read(camera, "backward", frame, size)
-        forward_flow = self._read(camera, "forward", frame - 1, size)
-        return back, forward_flow
-
-    def _read(self, camera: str, direction: str, frame: int, size: tuple[int, int]) -> np.ndarray:
-        path = self._find(self.folder / camera / direction, frame)
-        flow = read_flow(path)
-        height, width = size
-        rows, columns = flow.shape[:2]
-        if (rows, columns) != (height, width):
-            raise ValueError(
-                f"{path}: expected {width}x{height} pixels as the images of {camera} have, got "
-                f"{columns}x{rows}; compute the flow on undistorted and downscaled images."
-            )
-        return flow
+        flows = []
+        for direction, number in (("backward", frame), ("forward", frame - 1)):
+            path = self._find(self.folder / camera / direction, number)
+            flow = read_flow(path)
+            if flow.shape[:2] != size:
+                rows, columns = flow.shape[:2]
+                height, width = size
+                raise ValueError(
+                    f"{path}: expected {width}x{height} pixels as the images of {camera} have, got "
+                    f"{columns}x{rows}; compute the flow on undistorted and downscaled images."
+                )
+            flows.append(flow)
+        return flows[0], flows[1]
 
     def _find(self, folder: Path, frame: int) -> Path:
-        # Files may have been added since.
-        if frame not in self._listed.get(folder, {}):
-            self._listed[folder] = _files_by_frame(folder)
+        if frame not in self._listed.get(folder, {}):  # files may have been added since
+            content = listed(folder) if folder.is_dir() else ()
+            files = [path for path in content if path.suffix.lower() in SUFFIXES]
+            numbers = frame_numbers(folder, [path.stem for path in files]) if files else ()
+            self._listed[folder] = dict(zip(numbers, files, strict=True))
         files = self._listed[folder]
         if frame not in files:
             content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
@@ -104,14 +103,6 @@ class FlowFolder:
                 "each file after the frame on whose grid its flow lives, counting from 0."
             )
         return files[frame]
-
-
-def _files_by_frame(folder: Path) -> dict[int, Path]:
-    """Return the flow files of a folder by their frames."""
-    content = listed(folder) if folder.is_dir() else ()
-    files = [path for path in content if path.suffix.lower() in SUFFIXES]
-    numbers = frame_numbers(folder, [path.stem for path in files]) if files else ()
-    return dict(zip(numbers, files, strict=True))
 
 
 def read_flow(path: str | Path) -> np.ndarray:
@@ -132,42 +123,34 @@ def read_flow(path: str | Path) -> np.ndarray:
         )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a flow file, found none; check the path.")
-    flow = _read_flo(path) if suffix == ".flo" else _read_exr(path)
-    _check_dense(path, flow)
+    try:
+        flow = _read_flo(path) if suffix == ".flo" else _read_exr(path)
+        unknown = ~(np.abs(flow) < _UNKNOWN).all(axis=2)
+        if unknown.any():
+            y, x = np.argwhere(unknown)[0]
+            raise ValueError(
+                f"a flow at every pixel, got none at {unknown.sum()} of {unknown.size}, the first "
+                f"at x={x}, y={y}; use a method that returns dense flow"
+            )
+    except ValueError as error:
+        raise ValueError(f"{path}: expected {error}.") from None
     return flow
-
-
-def _check_dense(path: Path, flow: np.ndarray) -> None:
-    unknown = ~(np.abs(flow) < _UNKNOWN).all(axis=2)
-    if unknown.any():
-        y, x = np.argwhere(unknown)[0]
-        raise ValueError(
-            f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of "
-            f"{unknown.size}, the first at x={x}, y={y}; use a method that returns dense flow."
-        )
 
 
 def _read_flo(path: Path) -> np.ndarray:
     data = path.read_bytes()
-    width, height = _flo_size(path, data)
+    header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
+    width, height = (int(header[name]) for name in ("width", "height"))
     length = _HEADER.itemsize + 8 * width * height
-    if min(width, height) < 1 or len(data) != length:
+    is_flo = header["magic"] == np.float32(_MAGIC)
+    if not is_flo or min(width, height) < 1 or len(data) != length:
         raise ValueError(
-            f"{path}: expected {length} bytes for {width}x{height} pixels, got {len(data)}; the "
-            "file may be cut short."
+            f"{length} bytes for {width}x{height} pixels, got {len(data)}; the file may be cut short"
+            if is_flo
+            else f"a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}"
         )
     numbers = np.frombuffer(data, "<f4", offset=_HEADER.itemsize)
     return numbers.reshape(height, width, 2).astype(np.float32)
-
-
-def _flo_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Return the width and the height in the header of a `.flo` file."""
-    header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
-    if header["magic"] != np.float32(_MAGIC):
-        raise ValueError(
-            f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}."
-        )
-    return int(header["width"]), int(header["height"])
 
 
 def _read_exr(path: Path) -> np.ndarray:
@@ -177,17 +160,18 @@ def _read_exr(path: Path) -> np.ndarray:
     if len(pairs) != 1 or "motion.X" in channels:
         names = ", ".join("/".join(pair) for pair in _CHANNELS)
         raise ValueError(
-            f"{path}: expected one pair of the channels {names}, and no motion map, got "
-            f"{', '.join(sorted(channels))}."
+            f"one pair of the channels {names}, and no motion map, got "
+            f"{', '.join(sorted(channels))}"
         )
     return np.stack([channels[name] for name in pairs[0]], axis=-1)
 
 
 @FLOW_SOURCES.register("files", "FOLDER")
-def _make(folder: str, config: FlowConfig) -> FlowSource:
-    return partial(_from_folder, FlowFolder(folder))
+def _source(folder: str, config: FlowConfig) -> FlowSource:
+    flows = FlowFolder(folder).flows
 
+    def source(pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
+        height, width = pair.image.shape[:2]
+        return flows(pair.camera, pair.frame, (height, width))
 
-def _from_folder(folder: FlowFolder, pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
-    height, width = pair.image.shape[:2]
-    return folder.flows(pair.camera, pair.frame, (height, width))
+    return source
