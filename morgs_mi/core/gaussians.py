@@ -123,9 +123,6 @@ class _RepeatEach(dr.CustomOp):
     def forward(self) -> None:
         self.set_grad_out(dr.repeat(self.grad_in("x"), self.count))
 
-    def name(self) -> str:
-        return "morgs_mi.repeat_each"
-
 
 @dataclass(frozen=True)
 class Gaussians:

@@ -17,9 +17,9 @@ import numpy as np
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
+from morgs_mi.fit.detail import is_noisy
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.fit.noise import is_noisy
 from morgs_mi.fit.problem import FirstFrameProblem
 
 # Number of views that are fitted without dropout.

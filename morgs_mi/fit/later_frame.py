@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians, at_rest
+from morgs_mi.core.gaussians import Gaussians, at_rest, displaced
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.density import apply_plan, plan_additions
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.motion_stage import fit_motion
 from morgs_mi.fit.optimise import Steps, adam, optimise, select_rows, values_of, view_order
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
+from morgs_mi.method.losses import recon_loss
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS
+from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.objective import (
     Observations,
@@ -38,6 +38,8 @@ from morgs_mi.method.ssim import Target
 # falls: the residual has shown by then where Gaussians are missing, and enough steps are left to
 # fit the births.
 _LATEST_DENSITY_ROUND = 0.625
+# Learning rates of a motion model at the end, as a fraction of those at the start.
+_FINAL_RATE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,7 @@ class _LaterFrameFit:
         factory = MOTION_MODELS.make(motion.model, motion)
         if factory is not None:
             epochs = max(1, round(motion.model_share * config.epochs))
-            start, self.losses = fit_motion(
+            start, self.losses = _fit_motion(
                 MotionProblem(self._previous, active.views, problem.targets, rng),
                 factory(self._previous, problem.extent, rng),
                 start,
@@ -200,7 +202,11 @@ class _LaterFrameFit:
         problem = self._problem
         num_static = len(problem.previous) - len(problem.active.indices)
         plan = plan_additions(
-            self.gaussians(), self.scores.scores(), self._config.density, self._rng, num_static
+            self.gaussians(),
+            np.asarray(self.scores.scores),
+            self._config.density,
+            self._rng,
+            num_static,
         )
         # The optimiser has the residual, so the plan changes the previous Gaussians: a birth starts
         # from the past of its parent, and shares its residual.
@@ -246,3 +252,48 @@ class _LaterFrameFit:
             image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians
         )
         return losses_of(prediction, observations, objective)
+
+
+def _fit_motion(
+    problem: MotionProblem,
+    model: MotionModel,
+    start: MotionStart | None,
+    steps: Steps,
+    dssim_weight: float,
+) -> tuple[MotionStart, dict[str, float]]:
+    """Fit a motion model to the images by L_recon and the model's own losses.
+
+    Args:
+        problem: N Gaussians, the active views and their images.
+        model: of their motion.
+        start: displacement from which it starts, and colour from which the residual starts; None:
+            none.
+        steps: the steps, from the first one of the frame.
+        dssim_weight: lambda of eq. 2.
+
+    Returns:
+        The start of the residual, with the confidence of `start` or of the previous frame, and the
+        losses by name, means over the last round of views.
+    """
+    gaussians = problem.gaussians
+    start = start or MotionStart.without_motion(problem.gaussians)
+    start_gaussians = displaced(gaussians, start.displacement)
+
+    def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
+        view = problem.views[index]
+        image = view.render(moved(start_gaussians, *model.motion(parameters)), ("color",))
+        return {
+            "recon": recon_loss(image.color, problem.targets[index], dssim_weight, view.region),
+            **model.losses(parameters),
+        }
+
+    optimizer = adam(model.parameters)
+    total = len([*steps.views])
+    # Adam's steps are as long as the rate; long ones find the motion, short ones settle it.
+    decaying_steps = replace(steps, rate_factor=lambda step: _FINAL_RATE ** (step / total))
+    losses = optimise(optimizer, model.rates, losses_at, decaying_steps)
+    with dr.suspend_grad():
+        displacement, rotation = model.motion(values_of(optimizer))
+        change = moved(gaussians, displacement, rotation).quats - gaussians.quats
+    displacement = start.displacement + np.asarray(displacement)
+    return replace(start, displacement=displacement, rotation=np.array(change)), losses

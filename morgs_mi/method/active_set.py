@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Annotated
 
 import cv2
@@ -108,7 +109,13 @@ class ActiveSet:
         """Fractions of the Gaussians, of the views and of all their pixels that are active, from 0
         to 1.
         """
-        pixels = sum(view.pixel_fraction for view in self.views.values())
+        pixels = 0.0
+        for view in self.views.values():
+            size = view.camera.width * view.camera.height
+            drawn = (
+                size if view.region is None else view.region.num_blocks * prod(view.region.block)
+            )
+            pixels += min(1.0, drawn / size)
         return {
             "gaussians": len(self.indices) / max(self.num_gaussians, 1),
             "views": len(self.views) / max(self.num_views, 1),

@@ -40,6 +40,7 @@ class ErrorPerGaussian:
     Attributes:
         term: sum over the image of feature times error, which is 0: the gradients of the features
             are E. None: the step does not count.
+        scores: of the steps so far, [N].
     """
 
     def __init__(self, count: int, skip: int = 0) -> None:
@@ -47,7 +48,7 @@ class ErrorPerGaussian:
         self._count = count
         self._skip = skip
         self._probe: Tensor | None = None
-        self._largest = dr.zeros(mi.Float, count)
+        self.scores = dr.zeros(mi.Float, count)
 
     def features(self) -> Tensor | None:
         """Return the features [N, 1] to render in the next step, with detached weights; None: the
@@ -85,14 +86,10 @@ class ErrorPerGaussian:
         """Update the scores from the gradients of a step."""
         self._skip -= 1
         if self._probe is not None:
-            self._largest = dr.maximum(self._largest, dr.grad(self._probe).array)
-            dr.eval(self._largest)
+            self.scores = dr.maximum(self.scores, dr.grad(self._probe).array)
+            dr.eval(self.scores)
             self._probe = None
             self.term = None
-
-    def scores(self) -> np.ndarray:
-        """Return the scores [N] of the steps so far."""
-        return np.asarray(self._largest)
 
 
 def densification_scores(

@@ -95,6 +95,3 @@ class _SparseProduct(dr.CustomOp):
 
     def forward(self) -> None:
         self.set_grad_out(from_numpy(mi.TensorXf, self.matrix @ np.asarray(self.grad_in("x"))))
-
-    def name(self) -> str:
-        return "morgs_mi.sparse_product"

@@ -194,9 +194,6 @@ class Recon(dr.CustomOp):
     def forward(self) -> None:
         self.set_grad_out(dr.dot(self.gradient, self.grad_in("x")))
 
-    def name(self) -> str:
-        return "morgs_mi.recon_loss"
-
 
 def _statistics_pass(
     size: int, lanes: Lanes, height: Int32, target: Float

@@ -68,16 +68,6 @@ class ActiveView:
         blocks = blocks if self.region is None else blocks & self.region.drawn
         return replace(self, region=Region.of(self.grid, blocks)) if blocks.any() else None
 
-    @property
-    def pixel_fraction(self) -> float:
-        """Fraction of the view's pixels that is drawn, in [0, 1]."""
-        if self.region is None:
-            return 1.0
-        width, height = self.region.block
-        return min(
-            1.0, self.region.num_blocks * width * height / (self.camera.width * self.camera.height)
-        )
-
 
 def make_active_view(
     camera: Camera,

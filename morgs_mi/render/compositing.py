@@ -104,9 +104,6 @@ class _Blend(dr.CustomOp):
         ]
         return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
 
-    def name(self) -> str:
-        return "morgs_mi.blend"
-
 
 def weighted_sums(
     images: list[Float], region: Region, lists: BlockLists, layout: Layout

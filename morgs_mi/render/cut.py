@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Float
-from morgs_mi.render.exp2 import exp2
+from morgs_mi.render.backend import exp2
 
 PROFILE = 4  # z, gx, gy, 1 / sigma
 

@@ -31,10 +31,9 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Bool, Float, UInt32
-from morgs_mi.render.backend import add_mode, block_shape, on_aligned_stack
+from morgs_mi.render.backend import add_mode, block_shape, exp2, on_aligned_stack
 from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.cut import PROFILE, Cut
-from morgs_mi.render.exp2 import exp2
 from morgs_mi.render.region import NO_SLOT, Region
 from morgs_mi.render.render_config import RenderConfig
 

@@ -23,10 +23,9 @@ scene, single precision would lose the digits that cancel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import log2, sqrt
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -83,26 +82,15 @@ class Splats:
 
     def concatenated_with(self, other: Splats) -> Splats:
         """Return these splats, then the others, which are 0 in the channels that they lack."""
-
-        def columns_of(splats: Splats) -> tuple[Any, ...]:
-            columns = tuple(
-                splats.channels.get(n) or tuple(dr.zeros(mi.Float, len(splats)) for _ in v)
-                for n, v in self.channels.items()
-            )
-            bounds = splats.depths, splats.extent, splats.valid, splats.finite
-            return (
-                splats.shape,
-                columns,
-                *bounds,
-                splats.profile,
-                () if splats.view is None else splats.view,
-            )
-
-        shape, columns, *bounds, profile, view = concatenated(columns_of(self), columns_of(other))
-        channels = dict(zip(self.channels, columns, strict=True))
-        depths, extent, valid, finite = bounds
-        view = None if self.view is None else view
-        return Splats(shape, channels, depths, extent, valid, finite, profile, view)
+        channels = {
+            name: other.channels.get(name) or tuple(dr.zeros(mi.Float, len(other)) for _ in columns)
+            for name, columns in self.channels.items()
+        }
+        values, other_values = (
+            {name: value for name, value in vars(splats).items() if value is not None}
+            for splats in (self, replace(other, channels=channels))
+        )
+        return Splats(**concatenated(values, other_values))
 
 
 @dataclass(frozen=True)
@@ -121,7 +109,7 @@ class Views:
 
 
 def concatenated(a: Jit, b: Jit) -> Jit:
-    """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for
+    """Return two arrays, or trees of arrays, end to end; `dr.concat` would compile a kernel for
     every length.
     """
     count = dr.opaque(mi.UInt32, dr.width(a))

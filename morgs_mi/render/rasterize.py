@@ -170,7 +170,7 @@ def rasterize(
     view = cameras[0]
     if features is not None:
         features = float_tensor("rasterize()", "features", features)
-        sizes["features"] = int(features.shape[1])
+        sizes["features"] = int(np.shape(features)[1])
         channels = (*channels, "features")
     limits = None
     if depth_limit is not None:  # finite: a limit at infinity is one beyond all Gaussians
@@ -201,7 +201,9 @@ def rasterize(
         lists = build_lists(
             splats, [column for columns in values for column in columns], region, config, limits
         )
-    read_alpha = [name for name in channels if name == "alpha" or _reads_weight(name, background)]
+    # Divided by the sum of the weights, or composited by it over the background.
+    weighted = [*NORMALISED, *(["color"] if background is not None else [])]
+    read_alpha = [name for name in channels if name in ("alpha", *weighted)]
     layout = Layout(
         tuple(Channel(sizes[name], name not in detach_weights) for name in blended),
         bool(read_alpha),
@@ -213,7 +215,7 @@ def rasterize(
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
-        if _reads_weight(name, background):
+        if name in weighted:
             weight = dr.detach(coverage) if name in detach_weights else coverage
             weight = repeat_each(weight, sizes[name])
             if name in NORMALISED:  # 0 where nothing is drawn
@@ -228,13 +230,6 @@ def _image(tensors: Mapping[str, Tensor]) -> Image:
     others = dict(tensors)
     channels = {f.name: others.pop(f.name) for f in fields(Image) if f.name in others}
     return Image(**channels, others=others)
-
-
-def _reads_weight(channel: str, background: Sequence[float] | Jit | None) -> bool:
-    """Return whether a channel is divided by the sum of the weights, or composited by it over the
-    background.
-    """
-    return channel in NORMALISED or (channel == "color" and background is not None)
 
 
 def _over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:

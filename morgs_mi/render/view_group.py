@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -101,16 +102,10 @@ class ViewGroup:
                 splats = view_splats if splats is None else splats.concatenated_with(view_splats)
         if splats is None:
             return None
-        rows = dr.compress(touches(splats, self.region))
+        rows: Any = dr.compress(touches(splats, self.region))
         if not dr.width(rows):
             return None
-        at = {
-            name: dr.gather(type(value), value, rows)
-            for name, value in vars(splats).items()
-            if name not in ("channels", "profile")
-        }
-        color = dr.gather(tuple, splats.channels["color"], rows)
-        return replace(splats, **at, channels={"color": color})
+        return Splats(**dr.gather(dict, vars(splats), rows))
 
 
 @dataclass(frozen=True, eq=False)

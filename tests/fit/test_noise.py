@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.fit.noise import is_noisy, noise_of, white_noise_of
+from morgs_mi.fit.detail import is_noisy, noise_of, white_noise_of
 
 
 def bytes_of(values: np.ndarray) -> np.ndarray:

@@ -50,7 +50,7 @@ def scores_of(wall, views, targets):
         assert np.asarray(term).item() == 0
         dr.backward(term)
         scores.collect()
-    return scores.scores(), np.asarray(dr.grad(wall.sh_coeffs))
+    return np.asarray(scores.scores), np.asarray(dr.grad(wall.sh_coeffs))
 
 
 def test_error_per_gaussian__is_what_back_projection_gives(scene, monkeypatch):
@@ -80,7 +80,7 @@ def test_error_per_gaussian__ignores_noise():
 def test_error_per_gaussian__without_a_step_is_zero():
     scores = ErrorPerGaussian(3)
     scores.collect()
-    assert not scores.scores().any()
+    assert not np.asarray(scores.scores).any()
 
 
 def test_error_per_gaussian__skips_the_first_steps():

@@ -145,7 +145,8 @@ def _read_flo(path: Path) -> np.ndarray:
     is_flo = header["magic"] == np.float32(_MAGIC)
     if not is_flo or min(width, height) < 1 or len(data) != length:
         raise ValueError(
-            f"{length} bytes for {width}x{height} pixels, got {len(data)}; the file may be cut short"
+            f"{length} bytes for {width}x{height} pixels, got {len(data)}; the file may be cut "
+            "short"
             if is_flo
             else f"a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}"
         )

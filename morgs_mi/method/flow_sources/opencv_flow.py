@@ -18,7 +18,6 @@ from morgs_mi.core.color_space import byte_values
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
     FlowConfig,
-    FlowSource,
     both_directions,
     check_images,
 )
@@ -32,15 +31,6 @@ _ALLOCATE: Any = None
 _Method = Callable[[np.ndarray, np.ndarray, FlowConfig], np.ndarray]
 
 
-def _on_gray(method: _Method) -> _Method:
-    def on_gray(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-        return method(
-            cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY), config
-        )
-
-    return on_gray
-
-
 def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) -> _Method:
     """Return DIS with a preset.
 
@@ -51,22 +41,23 @@ def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) ->
     """
 
     def flow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
+        height, width = a.shape[:2]
         method = cv2.DISOpticalFlow.create(preset)
         if finest is not None:
-            method.setFinestScale(finest(a.shape[1], config))
-        return method.calc(_high_enough(a), _high_enough(b), _ALLOCATE)[: a.shape[0]]
+            method.setFinestScale(finest(width, config))
+        # At least half as high as wide: DIS chooses its coarsest level by the width alone and
+        # crashes where the height is less than a patch.
+        missing = max(0, width // 2 - height)
+        x, y = (
+            cv2.copyMakeBorder(gray, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for gray in _gray(a, b)
+        )
+        return method.calc(x, y, _ALLOCATE)[:height]
 
-    return _on_gray(flow)
+    return flow
 
 
-def _high_enough(image: np.ndarray) -> np.ndarray:
-    """Return an image with its last row repeated, so that it is at least half as high as wide.
-
-    DIS chooses its coarsest level by the width alone and crashes where the height is less than a
-    patch.
-    """
-    missing = max(0, image.shape[1] // 2 - image.shape[0])
-    return cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE)
+def _gray(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY)
 
 
 def _rlof(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
@@ -78,10 +69,6 @@ def _rlof(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
     return cv2.optflow.calcOpticalFlowDenseRLOF(
         a, b, _ALLOCATE, rlofParam=parameters, interp_type=cv2.optflow.INTERP_GEO
     )
-
-
-def _deepflow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-    return cv2.optflow.createOptFlow_DeepFlow().calc(a, b, _ALLOCATE)
 
 
 # OpenCV's other methods are no better at any cost (Farneback, PCAFlow, dual TV-L1), or crash or
@@ -96,7 +83,9 @@ FLOW_METHODS: dict[str, _Method] = {
     "dis-fine": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: 0),
     "dis-ultrafast": _dis(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
     "rlof": _rlof,
-    "deepflow": _on_gray(_deepflow),
+    "deepflow": lambda a, b, config: cv2.optflow.createOptFlow_DeepFlow().calc(
+        *_gray(a, b), _ALLOCATE
+    ),
 }
 
 
@@ -130,9 +119,9 @@ def optical_flow(
     return FLOW_METHODS[method](a, b, config)
 
 
-def _make(method: str, argument: str, config: FlowConfig) -> FlowSource:
-    return both_directions(partial(optical_flow, method=method, config=config))
-
-
 for _name in FLOW_METHODS:
-    FLOW_SOURCES.register(_name)(partial(_make, _name))
+    FLOW_SOURCES.register(_name)(
+        lambda _, config, name=_name: both_directions(
+            partial(optical_flow, method=name, config=config)
+        )
+    )

@@ -39,11 +39,7 @@ def refine_mask(
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
         mask: [H, W] bool.
         config: settings of GrabCut; None: the defaults.
-
-    Raises:
-        ValueError: the sizes of image and mask differ.
     """
-    _check_sizes("refine_mask()", image, mask)
     config = config or MaskConfig()
     clean = clean_mask(mask)
     small = _reduced(image, config.working_width)
@@ -52,18 +48,18 @@ def refine_mask(
     if not seed.any() or near.all() or seed.mean() > _COVERAGE:
         return clean
     labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
-    return clean_mask(_enlarged(_foreground(small, labels.astype(np.uint8)), mask.shape))
-
-
-def _foreground(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return the mask of the foreground [H, W] bool by GrabCut from its own labels, uint8."""
     cv2.setRNGSeed(0)  # GrabCut's k-means starts at random
-    back = np.zeros((1, 65))
-    front = np.zeros((1, 65))
+    models = np.zeros((2, 1, 65))  # of the background and of the foreground
     labels, _, _ = cv2.grabCut(
-        image, labels, (0, 0, 0, 0), back, front, _ITERATIONS, cv2.GC_INIT_WITH_MASK
+        small,
+        labels.astype(np.uint8),
+        (0, 0, 0, 0),
+        models[0],
+        models[1],
+        _ITERATIONS,
+        cv2.GC_INIT_WITH_MASK,
     )
-    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 
 def vote_superpixels(
@@ -80,35 +76,19 @@ def vote_superpixels(
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
         mask: [H, W] bool.
         config: settings of the superpixels; None: the defaults.
-
-    Raises:
-        ValueError: the sizes of image and mask differ.
     """
-    _check_sizes("vote_superpixels()", image, mask)
     config = config or MaskConfig()
     small = _reduced(image, config.working_width)
     if min(small.shape[:2]) < 2 * _SIDE:
         return mask
-    labels = _superpixels(small)
-    votes = cv2.resize(mask.astype(np.float32), labels.shape[::-1], interpolation=cv2.INTER_AREA)
-    shares = np.bincount(labels.ravel(), votes.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)
-    return _enlarged(shares[labels] >= config.superpixel_share, mask.shape)
-
-
-def _superpixels(image: np.ndarray) -> np.ndarray:
-    """Return the number of each pixel's superpixel, int32 [H, W]."""
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
     slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, _SIDE, _COMPACTNESS)
     slic.iterate(_SLIC_ITERATIONS)
     slic.enforceLabelConnectivity()
-    return np.asarray(slic.getLabels(), np.int32)
-
-
-def _check_sizes(place: str, image: np.ndarray, mask: np.ndarray) -> None:
-    if image.shape != (*mask.shape, 3):
-        raise ValueError(
-            f"{place}: `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}."
-        )
+    labels = np.asarray(slic.getLabels(), np.int32)
+    votes = cv2.resize(mask.astype(np.float32), labels.shape[::-1], interpolation=cv2.INTER_AREA)
+    shares = np.bincount(labels.ravel(), votes.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)
+    return _enlarged(shares[labels] >= config.superpixel_share, mask.shape)
 
 
 def clean_mask(mask: np.ndarray) -> np.ndarray:

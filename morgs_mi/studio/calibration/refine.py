@@ -46,7 +46,6 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.render_config import RenderConfig
@@ -60,6 +59,11 @@ from morgs_mi.studio.calibration.bundle import (
     likely_deviations,
     prior_deviations,
     undistorted,
+)
+from morgs_mi.studio.calibration.offset_equations import (
+    blurred,
+    gradient_products,
+    image_gradient,
 )
 
 # A camera with features in fewer tracks is not determined by them.

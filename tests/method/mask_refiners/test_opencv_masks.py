@@ -74,9 +74,3 @@ def test_mask_config__every_setting_acts(refine, settings):
     usual = refine(image, mask)
     for name, value in settings.items():
         assert not np.array_equal(refine(image, mask, MaskConfig(**{name: value})), usual), name
-
-
-@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
-def test_refine_mask__and_vote_superpixels_reject_another_size(refine):
-    with pytest.raises(ValueError, match=r"got \(4, 4, 3\)"):
-        refine(np.zeros((4, 4, 3)), np.ones((3, 4), bool))
