@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -46,11 +48,9 @@ def check_number(place: str, name: str, value: Any, interval: str) -> None:
         ValueError: it is not, which includes NaN.
     """
     low, high = map(float, interval[1:-1].split(","))
-    lies_in = (
-        isinstance(value, (int, float, np.number))
-        and not isinstance(value, bool)
-        and (low <= value if interval[0] == "[" else low < value)
-        and (value <= high if interval[-1] == "]" else value < high)
+    number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    lies_in = (low <= number if interval[0] == "[" else low < number) and (
+        number <= high if interval[-1] == "]" else number < high
     )
     requirement = f"`{name}` must be a number in {interval}"
     require(lies_in, place, requirement, repr(value), "set another value")

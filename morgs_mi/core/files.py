@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import shutil
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -32,15 +31,19 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
             ``write_json()``.
     """
     final = Path(path).resolve()  # a rename would replace a link, and `.` has no name
-    partial = _hidden(final, "partial")
-    old = _hidden(final, "old")
+    partial = _hidden(final, "partial", os.getpid())
+    old = _hidden(final, "old", os.getpid())
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
     if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
         raise FileExistsError(
             f"{place}: {path} is a device or a pipe, which would be replaced; name a file."
         )
-    for leftover in _left_behind(final):
-        _remove(leftover)
+    # Partial files of killed processes, one of which may have had this process's number.
+    for leftover in final.parent.glob(".partial-*-*"):
+        number = leftover.name.split("-")[1]
+        is_partial = number.isdecimal() and leftover == _hidden(final, "partial", number)
+        if is_partial and (int(number) == os.getpid() or not _alive(int(number))):
+            _remove(leftover)
     try:
         yield partial
         if replaces_folder and partial.is_dir():
@@ -56,9 +59,9 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
         _remove(old)
 
 
-def _hidden(path: Path, use: str) -> Path:
-    """Return a hidden path of this process beside another one."""
-    return path.with_name(f".{use}-{os.getpid()}-{path.name}")
+def _hidden(path: Path, use: str, process: object) -> Path:
+    """Return a hidden path of a process beside another one."""
+    return path.with_name(f".{use}-{process}-{path.name}")
 
 
 @contextmanager
@@ -164,20 +167,6 @@ def _remove_empty(folders: Iterable[Path]) -> None:
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
-
-
-def _left_behind(final: Path) -> list[Path]:
-    """Return the partial files of `final` of killed processes, one of which may have had this
-    process's number.
-    """
-    process_id = str(os.getpid())
-    pattern = re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
-    candidates = ((path, pattern.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
-    return [
-        path
-        for path, match in candidates
-        if match and (match[1] == process_id or not _alive(int(match[1])))
-    ]
 
 
 def _alive(process: int) -> bool:
