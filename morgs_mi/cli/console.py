@@ -11,7 +11,6 @@ from datetime import timedelta
 from typing import Any
 
 from rich.console import Console
-from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -90,9 +89,8 @@ def print_table(table: Table) -> None:
     """Print to standard output with complete columns, even where the terminal is narrower than the
     table.
     """
-    table_width = Measurement.get(OUT, OUT.options.update(max_width=10_000), table).maximum
     with naming_output():
-        _Console(width=max(OUT.width, table_width)).print(table)
+        _Console(width=10_000).print(table)
 
 
 def print_warning(text: str) -> None:

@@ -242,11 +242,10 @@ class Settings:
             config = apply_preset(config, self.preset)
         if self.config is not None:
             config = apply_values(config, read_config(self.config), str(self.config))
-        tables: dict[str, Any] = {}
         for key, value in self.given().items():
-            *path, name = key.split(".")
-            reduce(lambda table, part: table.setdefault(part, {}), path, tables)[name] = value
-        return apply_values(config, tables)
+            tables = reduce(lambda inner, name: {name: inner}, reversed(key.split(".")), value)
+            config = apply_values(config, tables)
+        return config
 
     def check_methods(self, config: StreamConfig) -> None:
         """Check the methods that a config names, and load their networks, before a fit begins.

@@ -130,16 +130,15 @@ def _expected(value: Any, kind: Any) -> str:
         if expected := _expected(value, args[0]):
             return f"{expected}, {words}"
         return "" if all(holds(value, limit) for _, holds, limit in bounds) else words
-    if origin is tuple:
-        repeats = args[1:] == (...,)
-        if not isinstance(value, tuple) or not (repeats or len(value) == len(args)):
-            return "a list" if repeats else f"a list of {len(args)} items"
-        items = map(_expected, value, args[:1] * len(value) if repeats else args)
-        item = next(filter(None, items), "")
-        return item and f"a list, each item {item}"
+    if origin is tuple:  # (kind, ...) or one kind several times
+        length = "" if args[1] is ... else f" of {len(args)} items"
+        if not isinstance(value, tuple) or (length and len(value) != len(args)):
+            return f"a list{length}"
+        misfits = filter(None, (_expected(item, args[0]) for item in value))
+        return next((f"a list, each item {expected}" for expected in misfits), "")
     if origin is dict and isinstance(value, dict):
-        item = next(filter(None, (_expected(item, args[1]) for item in value.values())), "")
-        return item and f"a table, each value {item}"
+        misfits = filter(None, (_expected(item, args[1]) for item in value.values()))
+        return next((f"a table, each value {expected}" for expected in misfits), "")
     if origin is Literal:
         return "" if value in args else " or ".join(args)
     if kind in _NUMBERS:

@@ -40,7 +40,7 @@ class Leaf:
     the leaf."""
     on: bool = False
     sizes: tuple[int, ...] = (1, 2)
-    pair: tuple[str, float] = ("x", 0.5)
+    pair: tuple[float, float] = (1.5, 0.5)
     limit: float | None = 0.5
     """Limit; None: no limit."""
     mode: Literal["fast", "exact"] | None = None
@@ -114,7 +114,7 @@ def round_trip(config: Any, path: Path) -> Any:
             limit=None,
             mode="exact",
         ),
-        Leaf(pair=("", -0.0), count=2**63),
+        Leaf(pair=(0.25, -0.0), count=2**63),
         Root(),
         Root(Branch(Leaf(count=7, name="none"), weight=-1.0), seed=4),
     ],
@@ -206,7 +206,7 @@ def test_apply_values__replaces_only_what_is_named() -> None:
             "sizes = [1, 'a']",
             "`sizes` must be a list, each item a whole number below 2^64, got (1, 'a').",
         ),
-        (Leaf(), "pair = ['a']", "`pair` must be a list of 2 items, got ('a',)."),
+        (Leaf(), "pair = [2]", "`pair` must be a list of 2 items, got (2,)."),
         (Leaf(), "mode = 'slow'", "`mode` must be fast or exact, got 'slow'."),
         (
             Root(),
