@@ -158,16 +158,12 @@ def _release(error: BaseException) -> None:
 
 def _chain(error: BaseException) -> list[BaseException]:
     """Return an error with all its causes, contexts and members."""
-    links: list[BaseException] = []
-    stack: list[BaseException | None] = [error]
-    while stack:
-        link = stack.pop()
-        if link is None or any(link is other for other in links):
-            continue
-        links.append(link)
-        stack += [link.__cause__, link.__context__]
-        if isinstance(link, BaseExceptionGroup):
-            stack += link.exceptions
+    links = [error]
+    for link in links:  # which grows
+        members = link.exceptions if isinstance(link, BaseExceptionGroup) else ()
+        for other in (link.__cause__, link.__context__, *members):
+            if other is not None and all(other is not known for known in links):
+                links.append(other)
     return links
 
 
