@@ -419,11 +419,11 @@ def masked(masks):
         ),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.zeros((10, 3))),
-            r"`point_colors` must be \[200, 3\]",
+            r"`points` and `point_colors` must be \[P, 3\], got \[200, 3\] and",
         ),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))),
-            r"`points` must be \[P, 3\]",
+            r"`points` and `point_colors` must be \[P, 3\]",
         ),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.full((200, 3), 128)),

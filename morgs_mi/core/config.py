@@ -126,7 +126,7 @@ def _expected(value: Any, kind: Any) -> str:
         return "" if fits else " or ".join(arms[arm] for arm in args if arm is not NoneType)
     if origin is Annotated:
         bounds = [(*_BOUNDS[type(bound)], *astuple(bound)) for bound in args[1:]]
-        words = " and ".join(f"{words} {limit:g}" for words, _, limit in bounds)
+        words = " and ".join(f"{words} {limit}" for words, _, limit in bounds)
         if expected := _expected(value, args[0]):
             return f"{expected}, {words}"
         return "" if all(holds(value, limit) for _, holds, limit in bounds) else words
@@ -140,7 +140,7 @@ def _expected(value: Any, kind: Any) -> str:
         misfits = filter(None, (_expected(item, args[1]) for item in value.values()))
         return next((f"a table, each value {expected}" for expected in misfits), "")
     if origin is Literal:
-        return "" if value in args else " or ".join(args)
+        return "" if value in args else f"one of {', '.join(args)}"
     if kind in _NUMBERS:
         number, low, high = _NUMBERS[kind]
         fits = isinstance(value, number) and not isinstance(value, bool) and low <= value <= high

@@ -207,7 +207,7 @@ def test_apply_values__replaces_only_what_is_named() -> None:
             "`sizes` must be a list, each item a whole number below 2^64, got (1, 'a').",
         ),
         (Leaf(), "pair = [2]", "`pair` must be a list of 2 items, got (2,)."),
-        (Leaf(), "mode = 'slow'", "`mode` must be fast or exact, got 'slow'."),
+        (Leaf(), "mode = 'slow'", "`mode` must be one of fast, exact, got 'slow'."),
         (
             Root(),
             "[branch.leaf]\ncount = -1",
@@ -305,7 +305,7 @@ def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]
         ("seed", 2**64, "a whole number below 2^64, got 18446744073709551616."),
         ("on", 1, "true or false, got 1."),
         ("name", None, "a string, got None."),
-        ("mode", "yes", "off or auto or on, got 'yes'."),
+        ("mode", "yes", "one of off, auto, on, got 'yes'."),
         ("blurs", (3, -1), "a list, each item above 0, got (3, -1)."),
         (
             "size",

@@ -37,11 +37,11 @@ class LiveConfig:
     """Time in seconds for the frames after the first one; by default until the cameras end."""
     record: bool = True
     """Store the images of all fitted frames; otherwise of the first one alone."""
-    fps: Annotated[float, Ge(1e-6), Le(1e6)] = 30
+    fps: Annotated[float, Ge(1e-6), Le(1_000_000)] = 30
     """Frames per second at which the stream is played."""
-    timeout: Annotated[float, Gt(0), Le(1e6)] = 10
+    timeout: Annotated[float, Gt(0), Le(1_000_000)] = 10
     """Seconds to wait for a camera before it is left out."""
-    warm_up: Annotated[float, Ge(0), Le(1e6)] = 1
+    warm_up: Annotated[float, Ge(0), Le(1_000_000)] = 1
     """Seconds in which the cameras adjust their exposure before the first images are taken; not of
     files.
     """

@@ -29,7 +29,7 @@ class SynthConfig:
     height: Annotated[int, Ge(2), MultipleOf(2)] = 240
     """Height of the images in pixels, even."""
     # A sampler of Mitsuba takes no more.
-    spp: Annotated[int, Ge(1), Le(1e6)] | None = None
+    spp: Annotated[int, Ge(1), Le(1_000_000)] | None = None
     """Samples per pixel; 16 gives noise at 42 dB. The scene's own, usually 16, if not given."""
     noise: Annotated[float, Ge(0), Lt(1)] | None = None
     """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey

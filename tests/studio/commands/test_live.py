@@ -107,8 +107,8 @@ def test_Live__ends_with_a_summary_on_ctrl_c(
     ("args", "parts"),
     [
         ((), ("--camera must have a source per camera, got none",)),
-        (("--timeout", 1e18), ("--timeout must be a number in [0, 1e6], got 1e+18",)),
-        (("--fps", 1e9), ("--fps must be a number in [1e-6, 1e6], got 1000000000.0",)),
+        (("--timeout", 1e18), ("--timeout must be above 0 and at most 1000000, got 1e+18",)),
+        (("--fps", 1e9), ("--fps must be at least 1e-06 and at most 1000000, got 1000000000.0",)),
         (
             ("--test-view", "x", "--camera", "VIDEOS"),
             ("test_view` must be an index in 0..2, one of cam0, cam1, cam2",),

@@ -296,7 +296,7 @@ def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path
         ),
         ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
         ({"frames": 0}, "`frames` must be at least 1, got 0"),
-        ({"timeout": 0.0}, "`timeout` must be above 0 and at most 1e\\+06, got 0.0"),
+        ({"timeout": 0.0}, "`timeout` must be above 0 and at most 1000000, got 0.0"),
     ],
 )
 def test_fit_live__refuses_settings_out_of_range(
