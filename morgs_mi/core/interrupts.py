@@ -162,7 +162,7 @@ def _chain(error: BaseException) -> list[BaseException]:
     for link in links:  # which grows
         members = link.exceptions if isinstance(link, BaseExceptionGroup) else ()
         for other in (link.__cause__, link.__context__, *members):
-            if other is not None and all(other is not known for known in links):
+            if other is not None and all(other is not entry for entry in links):
                 links.append(other)
     return links
 
