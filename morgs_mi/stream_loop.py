@@ -279,7 +279,7 @@ class StreamLoop:
                 computed while this frame is fitted. They change nothing else.
             recorded: images with which the next frame is compared for flow and changes; None:
                 `images`. They differ in a first frame whose `images` are interpolated to one
-                instant, because cameras have delays.
+                timestamp, because cameras have delays.
             on_provisional: as for `step`.
         """
         start_time = time.perf_counter()

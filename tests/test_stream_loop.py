@@ -211,7 +211,7 @@ def test_push__stream_carries_births_and_deaths(clip):
 
 @pytest.mark.slow
 def test_push__fits_views_at_their_own_times(clip):
-    """Two of four views are half a frame late and two half a frame early; at the instants nobody
+    """Two of four views are half a frame late and two half a frame early; at the timestamps nobody
     saw the ball.
     """
     delays = (0.5, -0.5, 0.5, -0.5)
@@ -322,8 +322,8 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
     assert [len(views) for views in flow_views] == [2, 2, 2]
     assert all(f"cam{gone:02d}" not in views for views in flow_views[:2])
     assert flow_views[2] == usual
-    # Every frame follows the motion, from three of four views too: it shows its own instant better
-    # than the last did.
+    # Every frame follows the motion, from three of four views too: it shows its own timestamp
+    # better than the last did.
     assert all(score_list[t][t] > score_list[t - 1][t] + 1 for t in (1, 2, 3)), score_list
 
 

@@ -5,8 +5,8 @@ these times gains.
 
 Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by cameras of one clock, and by
 cameras that are up to 1.5 frames apart. The second clip is fitted as it is and with the
-offsets that are found, over the same instants as the first. Scores are means over the later frames
-of the held-out view. Its clock is the reference.
+offsets that are found, over the same timestamps as the first. Scores are means over the later
+frames of the held-out view. Its clock is the reference.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float]
 
 
 def moving_psnr(capture: Capture, frames: range, first: int, config: StreamConfig) -> float:
-    """Return the mean PSNR where things move of a fit of some instants, of which the first is frame
-    `first` of the held-out clip.
+    """Return the mean PSNR where things move of a fit of some timestamps, of which the first is
+    frame `first` of the held-out clip.
     """
     test = capture.reference_view
     loop = new_loop(capture, config)

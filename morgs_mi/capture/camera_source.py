@@ -25,15 +25,15 @@ class CameraSource:
     reader: FrameReader  #: Reader of the clip.
     lens: Lens  #: The lens that the clip was recorded through.
     undistortion: Undistortion | None  #: The pixel maps that remove the lens distortion, or None.
-    #: The clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
+    #: The clip's frames that show the timestamps 0, 1, ... of the recording, -1 for none, int [T].
     frame_indices: np.ndarray
-    #: The share of the time to the clip's next frame that has passed at each instant [T]; None:
+    #: The share of the time to the clip's next frame that has passed at each timestamp [T]; None:
     #: none has.
     shares: np.ndarray | None = None
     #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None
     #: if all are.
     recorded_mask: np.ndarray | None = None
-    delay: float = 0.0  #: Time from an instant to the frame that shows it, in frames of the clip.
+    delay: float = 0.0  #: Time from a timestamp to the frame that shows it, in frames of the clip.
     #: Stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
     display_exposure: float | None = None
     notes: tuple[str, ...] = ()  #: Sentences on its masks.
@@ -54,7 +54,7 @@ class CameraSource:
             lens: the lens that it was recorded through.
             camera: the pinhole camera at the clip's size.
             masks: files with masks of the pixels that are used.
-            times: frames that show the instants.
+            times: frames that show the timestamps.
 
         Raises:
             FileNotFoundError: a mask is missing.
@@ -72,7 +72,7 @@ class CameraSource:
             notes=tuple(notes),
         )
 
-    def at_instants(self) -> CameraSource:
+    def at_timestamps(self) -> CameraSource:
         """Return the source without a delay: its images are interpolated instead."""
         if not self.delay:
             return self
@@ -81,7 +81,7 @@ class CameraSource:
         return replace(self, frame_indices=indices, shares=positions - indices, delay=0.0)
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
-        """Yield the processed images of the instants start..stop-1, with an error in place of a
+        """Yield the processed images of the timestamps start..stop-1, with an error in place of a
         missing image.
         """
         if self.shares is not None:
@@ -91,9 +91,9 @@ class CameraSource:
             return
         indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
-        for instant, index in enumerate(indices, start):
+        for timestamp, index in enumerate(indices, start):
             if index < 0:
-                yield ValueError(f"{self.reader.path}: no frame at instant {instant}.")
+                yield ValueError(f"{self.reader.path}: no frame at timestamp {timestamp}.")
                 continue
             image = next(frames)
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image

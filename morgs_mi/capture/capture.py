@@ -1,6 +1,6 @@
 """A multi-view recording: pinhole cameras and their synchronised frames.
 
-`layouts/layout_registry.py` determines the layout of a capture folder, `layouts/clips.py` finds
+`layouts/reader_registry.py` finds the reader of a capture folder, `layouts/clips.py` finds
 each camera's clip. An optional ``capture.json`` has settings (see `timeline.read_settings`);
 ``truth/`` may hold ground truth.
 """
@@ -19,7 +19,7 @@ import numpy as np
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
-from morgs_mi.capture.layouts.layout_registry import find_layout
+from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
@@ -37,7 +37,7 @@ MIN_SIDE = 32
 
 @dataclass(frozen=True)
 class Frame:
-    """One instant in all views."""
+    """One timestamp in all views."""
 
     index: int  #: Position in the recording, from 0.
     #: Per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light.
@@ -46,7 +46,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class PartialFrame:
-    """One instant in the views that have an image of it."""
+    """One timestamp in the views that have an image of it."""
 
     index: int  #: Position in the recording, from 0.
     images: tuple[np.ndarray | None, ...]  #: As in `Frame`, None for a missing image.
@@ -57,7 +57,7 @@ class PartialFrame:
     unread: bool = False
 
     def check_images(self, views: Sequence[int]) -> None:
-        """Raise `OSError` if images of this instant could not be read, and none of some views is
+        """Raise `OSError` if images of this timestamp could not be read, and none of some views is
         left: the recording may have disappeared.
         """
         if self.unread and all(self.images[view] is None for view in views):
@@ -256,7 +256,7 @@ class Capture:
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Yield frames start..stop-1, decoded in a background thread.
 
-        Frame 0 has images at its instant, which are interpolated where cameras have delays.
+        Frame 0 has images at its timestamp, which are interpolated where cameras have delays.
 
         Raises:
             ValueError: a file is truncated or broken; the message names the frame.
@@ -309,7 +309,7 @@ class Capture:
                 for name in errors.keys() - missing:
                     _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
                 missing = set(errors)
-                # With gaps, instants without an image are part of the recording.
+                # With gaps, timestamps without an image are part of the recording.
                 unread = bool(errors) and not (
                     self.reading.gaps and os.path.exists(self._sources[0].reader.path)
                 )
@@ -317,16 +317,16 @@ class Capture:
                 recorded = None
                 if index == 0 and any(source.delay for source in self._sources):
                     recorded = images
-                    images = self._at_first_instant(images)
+                    images = self._at_first_timestamp(images)
                 yield PartialFrame(index, images, problems, recorded, unread)
         finally:
             for stream in streams:
                 stream.close()
 
-    def _at_first_instant(
+    def _at_first_timestamp(
         self, images: Sequence[np.ndarray | None]
     ) -> tuple[np.ndarray | None, ...]:
-        """Return the images of the first frame, interpolated at its instant.
+        """Return the images of the first frame, interpolated at its timestamp.
 
         The motion in the first frame is unknown, so delays cannot be rendered. An image that cannot
         be interpolated stays as it is.
@@ -334,7 +334,7 @@ class Capture:
         first_images = list(images)
         for view, source in enumerate(self._sources):
             if first_images[view] is not None and source.delay:
-                result = next(source.at_instants().images(self.cameras[view], 0, 1))
+                result = next(source.at_timestamps().images(self.cameras[view], 0, 1))
                 if isinstance(result, np.ndarray):
                     first_images[view] = result
         return tuple(first_images)
@@ -357,7 +357,7 @@ def load_capture(
     """Open a capture folder: read the calibration and the header of every clip.
 
     Args:
-        path: the folder; `layouts/layout_registry.py` lists the supported layouts.
+        path: the folder; `layouts/reader_registry.py` lists the readers.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest
             whole size).
         test_view: index or name of the held-out camera, several of them, or None for none; "auto"
@@ -386,8 +386,8 @@ def load_capture(
         raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
     reading = reading or ReadConfig()
     settings = read_settings(path / CAPTURE)
-    layout = find_layout(path)
-    every = layout.read(path).centred(path)
+    reader = find_reader(path)
+    every = reader.read(path).centred(path)
     calibration = every.without(path, reading.without)
     readers = open_clips(calibration.clips, reading.gaps)
     recorded = _at_clip_sizes(path, calibration.cameras, readers)
@@ -412,7 +412,7 @@ def load_capture(
         truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
         _sources=sources,
         downscale=downscale,
-        layout=layout.name,
+        layout=reader.name,
         reading=reading,
         notes=(
             *common.notes,
@@ -474,7 +474,7 @@ def _downscaled_cameras(
     readouts: Sequence[float],
 ) -> list[Camera]:
     """Return the downscaled cameras of clips, with their delays and readouts: `readouts` are in
-    frames of the clips, the cameras' in instants.
+    frames of the clips, the cameras' in timestamps.
     """
     cameras = []
     for camera, times, readout in zip(recorded, clips, readouts, strict=True):

@@ -1,4 +1,4 @@
-"""Points seen in several views of one instant: features, matches and triangulation.
+"""Points seen in several views of one timestamp: features, matches and triangulation.
 
 Notation: a feature x [2] is a pixel position with pixel centres at +0.5, as in `Camera`; a match is
 a pair of features in two views. Matching does not use the poses, so poses can be checked against

@@ -20,13 +20,11 @@ from morgs_mi.io.video import FolderReader, FrameReader
 
 @dataclass(frozen=True)
 class ImageNumbers:
-    """Alignment of clips by the numbers of their images: the image o + r t of a clip shows instant
-    t.
-    """
+    """Alignment of clips by the numbers of their images: image o + r t shows timestamp t."""
 
     offsets: np.ndarray  #: o of each clip [C].
     rates: np.ndarray  #: r of each clip [C].
-    #: Time between two instants, in frames of the clip with the most frames per time.
+    #: Time between two timestamps, in frames of the clip with the most frames per time.
     interval: float = 1.0
     notes: tuple[str, ...] = ()  #: A sentence for each assumption.
 

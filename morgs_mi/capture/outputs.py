@@ -7,7 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypeVar
 
-from morgs_mi.capture.layouts.layout_registry import LAYOUTS
+from morgs_mi.capture.layouts.reader_registry import READERS
 
 PathLike = TypeVar("PathLike", str, Path)
 
@@ -23,7 +23,7 @@ def check_output(path: PathLike) -> PathLike:
     """
     final = Path(path).resolve()
     for folder in (final, *final.parents):
-        if any(layout.find(folder) for layout in LAYOUTS):
+        if any(reader.find(folder) for reader in READERS):
             raise ValueError(
                 f"{path}: expected an output outside of captures, which stay as they were "
                 f"recorded, got one in the capture {folder}; choose another place."

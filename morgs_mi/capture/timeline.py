@@ -1,15 +1,15 @@
 """Alignment of a capture's clips in time, and the settings that control how they are read.
 
-An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of a clip if
+A timestamp t = 0, 1, ... is a frame of the recording. It is shown by frame k of a clip if
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
 Folders of images have an o and r by the numbers of their images, too (see `image_numbers`).
 
 In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows
-the instant. If o is not whole, the clip has no frame of the instant. With a whole r, the nearest
-frame is used unchanged: it is always later by the same time, the camera's delay (see `Camera`).
-Otherwise an image is interpolated between two frames (see `interpolation`).
+the timestamp. If o is not whole, the clip has no frame of the timestamp. With a whole r, the
+nearest frame is used unchanged: it is always later by the same time, the camera's delay (see
+`Camera`). Otherwise an image is interpolated between two frames (see `interpolation`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _INTERVALS = {
     "display_exposure": "[-100, 100]",
 }
 _SETTINGS = {*_INTERVALS, "test_view", "readout"}
-# Distance in frames up to which a frame shows an instant.
+# Distance in frames up to which a frame shows a timestamp.
 _NEAR = 0.5
 
 
@@ -48,11 +48,11 @@ class ReadConfig:
     """
 
     trim: bool = False
-    """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
+    """Whether to use only the timestamps that all clips cover, at their lowest frame rate."""
     offset: dict[str, float] = field(default_factory=dict)
     """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative
-    for a clip that started later. Instants that not all clips cover are left out, as with trim. If
-    it is not whole, the nearest frames are used, and `Camera.delay` is the rest; only the first
+    for a clip that started later. Timestamps that not all clips cover are left out, as with trim.
+    If it is not whole, the nearest frames are used, and `Camera.delay` is the rest; only the first
     images are interpolated between two frames."""
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
@@ -65,23 +65,23 @@ class ReadConfig:
 
 @dataclass(frozen=True, eq=False)
 class ClipTimes:
-    """Frames of one clip that show the instants of the recording."""
+    """Frames of one clip that show the timestamps of the recording."""
 
     frame_indices: np.ndarray  #: The clip's frames in ascending order, -1 for none, int [T].
-    #: Share of the time to the next frame that has passed at each instant [T]; None: no image is
+    #: Share of the time to the next frame that has passed at each timestamp [T]; None: no image is
     #: interpolated.
     shares: np.ndarray | None
-    delay: float  #: Time from an instant to the frame that shows it, in frames of the clip.
-    rate: float  #: Frames of the clip per instant.
+    delay: float  #: Time from a timestamp to the frame that shows it, in frames of the clip.
+    rate: float  #: Frames of the clip per timestamp.
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Frames of each clip that show the instants of the recording."""
+    """Frames of each clip that show the timestamps of the recording."""
 
     clips: tuple[ClipTimes, ...]  #: Of each camera's clip.
-    fps: float  #: Instants per second.
-    unchanged: bool  #: Whether instant t is frame t of every clip.
+    fps: float  #: Timestamps per second.
+    unchanged: bool  #: Whether timestamp t is frame t of every clip.
     #: A sentence for each clip of variable frame rate, and on the numbers of images.
     notes: tuple[str, ...] = ()
 
@@ -101,12 +101,12 @@ def timeline(
         names: names of the cameras.
         readers: one clip per camera.
         config: how clips that do not match are read.
-        max_frames: number of instants at most.
+        max_frames: number of timestamps at most.
         fps: actual frame rate of all clips, or None for the rates in their headers.
 
     Raises:
         ValueError: lengths or rates differ or a rate varies and `config` does not resolve it, a
-            clip is cut off, the clips have no instant in common, or `config` names an unknown
+            clip is cut off, the clips have no timestamp in common, or `config` names an unknown
             camera or has an offset that is not finite.
     """
     check_names(path, "offset", config.offset, names)
@@ -114,12 +114,12 @@ def timeline(
     for note in numbers.notes:
         _LOG.warning("%s: %s", path, note)
     exact = _clocks(names, readers, config, fps, numbers)
-    clocks, instants = _instants(path, names, readers, config, exact, max_frames)
-    positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
+    clocks, timestamps = _timestamps(path, names, readers, config, exact, max_frames)
+    positions = clocks.offsets[:, None] + clocks.rates[:, None] * timestamps
     offsets = [config.offset.get(name, 0) for name in names]
     clips = list(map(_clip_times, readers, positions, clocks.rates.tolist(), offsets))
     if config.gaps:
-        # Images that are far from their instants are left out.
+        # Images that are far from their timestamps are left out.
         for c, clip in enumerate(clips):
             far = np.abs(_image_positions(readers[c], clip, positions[c]) - positions[c]) > _NEAR
             clips[c] = replace(clip, frame_indices=np.where(far, -1, clip.frame_indices))
@@ -131,7 +131,7 @@ def timeline(
     return Timeline(tuple(clips), clocks.fps, unchanged, (*numbers.notes, *notes))
 
 
-def _instants(
+def _timestamps(
     path: Path,
     names: Sequence[str],
     readers: Sequence[FrameReader],
@@ -139,10 +139,10 @@ def _instants(
     exact: _Clocks,
     max_frames: int | None,
 ) -> tuple[_Clocks, np.ndarray]:
-    """Return the clocks by which frames are selected, and the instants [T]."""
+    """Return the clocks by which frames are selected, and the timestamps [T]."""
     if config.trim or config.offset:
         clocks = _without_drift(exact, readers, max_frames)
-        return clocks, _common_instants(path, names, readers, config, clocks)[:max_frames]
+        return clocks, _common_timestamps(path, names, readers, config, clocks)[:max_frames]
     num_frames = _num_frames(path, readers, max_frames, config.gaps)
     # Frames with the same index must be simultaneous.
     drift = np.ptp(exact.rates) * (num_frames - 1)
@@ -153,15 +153,15 @@ def _instants(
             f"are up to {drift:.1f} frames apart; use the lowest rate with --trim, or set the "
             "true one as `fps` in capture.json."
         )
-    instants = np.arange(num_frames, dtype=float)
-    return replace(exact, rates=np.ones(len(readers))), instants
+    timestamps = np.arange(num_frames, dtype=float)
+    return replace(exact, rates=np.ones(len(readers))), timestamps
 
 
 def _clip_times(
     reader: FrameReader, positions: np.ndarray, rate: float, offset: float
 ) -> ClipTimes:
-    """Return the frames of a clip that show the instants at `positions` [T], by the clip's rate and
-    its offset in `ReadConfig`.
+    """Return the frames of a clip that show the timestamps at `positions` [T], by the clip's rate
+    and its offset in `ReadConfig`.
     """
     if reader.positions is not None or reader.num_frames < 2 or offset % 1 == 0:
         return ClipTimes(nearest_frames(reader, positions), None, 0.0, rate)
@@ -174,7 +174,7 @@ def _clip_times(
 
 
 def _image_positions(reader: FrameReader, clip: ClipTimes, positions: np.ndarray) -> np.ndarray:
-    """Return the positions of the images that show the instants at `positions` [T]."""
+    """Return the positions of the images that show the timestamps at `positions` [T]."""
     if clip.shares is not None:
         return positions
     if reader.positions is not None:
@@ -189,7 +189,7 @@ def _warn_apart(
     positions: np.ndarray,
     clocks: _Clocks,
 ) -> None:
-    """Warn if images of one instant are apart, by the clips' clocks; the instants are at
+    """Warn if images of one timestamp are apart, by the clips' clocks; the timestamps are at
     `positions` [C, T].
     """
     places = np.array(list(map(_image_positions, readers, clips, positions)))
@@ -199,12 +199,12 @@ def _warn_apart(
     earliest = np.where(has_frame, times, np.inf).min(axis=0)
     spread = float(np.max(latest - earliest, initial=0)) / clocks.fps
     if spread > 1e-3:
-        _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * spread)
+        _LOG.warning("%s: images of one timestamp are up to %.1f ms apart.", path, 1e3 * spread)
 
 
 @dataclass(frozen=True)
 class _Clocks:
-    """Offset o and rate r of every clip [C], and the number of instants per second (see the
+    """Offset o and rate r of every clip [C], and the number of timestamps per second (see the
     module's docstring).
     """
 
@@ -243,7 +243,7 @@ def _without_drift(
     """Return the clocks with a whole rate r for each clip that differs from it by less than half a
     frame in the end.
 
-    Programs write 29.97 or 30 fps for the same camera. The distance of the frames from an instant
+    Programs write 29.97 or 30 fps for the same camera. The distance of the frames from a timestamp
     is then constant.
     """
     periods = min(
@@ -254,14 +254,14 @@ def _without_drift(
     return replace(clocks, rates=np.where(drift < _NEAR, whole, clocks.rates))
 
 
-def _common_instants(
+def _common_timestamps(
     path: Path,
     names: Sequence[str],
     readers: Sequence[FrameReader],
     config: ReadConfig,
     clocks: _Clocks,
 ) -> np.ndarray:
-    """Return the instants that all clips cover [T]."""
+    """Return the timestamps that all clips cover [T]."""
     lengths = np.array([_usable_periods(reader, config) for reader in readers])
     first = np.ceil(np.max(-clocks.offsets / clocks.rates))
     last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
@@ -271,7 +271,7 @@ def _common_instants(
         stops = (lengths - clocks.offsets) / per_second
         spans = zip(names, starts, stops, strict=True)
         table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
-        raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
+        raise ValueError(f"{path}: the clips have no timestamp in common, {table}; check `offset`.")
     return np.arange(first, last + 1)
 
 
@@ -294,7 +294,7 @@ def _notes(reader: FrameReader, clip: ClipTimes) -> tuple[str, ...]:
     return (
         f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
         f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; "
-        f"each instant has the frame nearest in time: {repeats} repeat one, "
+        f"each timestamp has the frame nearest in time: {repeats} repeat one, "
         f"{len(indices) - len(frames)} have none.",
     )
 
@@ -330,7 +330,7 @@ def _check_complete(reader: FrameReader, required: int) -> None:
 
 
 def _check_even(reader: FrameReader, required: int) -> None:
-    """Check that frame t of a clip shows instant t, for the first `required` frames."""
+    """Check that frame t of a clip shows timestamp t, for the first `required` frames."""
     if reader.positions is None:
         return
     assert reader.fps
@@ -349,7 +349,7 @@ def _check_even(reader: FrameReader, required: int) -> None:
 def _num_frames(
     path: Path, readers: Sequence[FrameReader], max_frames: int | None, gaps: bool
 ) -> int:
-    """Return the number of instants of clips that are not aligned."""
+    """Return the number of timestamps of clips that are not aligned."""
     if gaps:
         longest = max(_periods(reader) for reader in readers)
         return min(longest, max_frames or longest)
@@ -364,8 +364,8 @@ def _num_frames(
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "
-            f"frames with `max_frames={shortest}`, the instants that all clips cover with --trim, "
-            "align the clips with --offset, or leave cameras out with --without."
+            f"frames with `max_frames={shortest}`, the timestamps that all clips cover with "
+            "--trim, align the clips with --offset, or leave cameras out with --without."
         )
     return shortest
 

@@ -155,7 +155,7 @@ class Reading:
     """Options for differences between the clips of a capture: the fields of `ReadConfig`."""
 
     trim: Flag = False
-    """Use the instants that all clips contain, at their lowest frame rate."""
+    """Use the timestamps that all clips contain, at their lowest frame rate."""
     offset: Annotated[dict[str, float], arg(help_behavior_hint=""), _OFFSETS] = field(
         default_factory=dict
     )

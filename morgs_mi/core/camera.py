@@ -36,7 +36,7 @@ class Camera:
         name: in the capture, e.g. ``cam00``.
         near: depth in world units below which Gaussians are not rendered. The cameras of a capture
             have a depth that follows the scene (see `with_near_planes`).
-        delay: frames by which its images are later than the instants of the recording, at the
+        delay: frames by which its images are later than the timestamps of the recording, at the
             middle row. Gaussians with motion are rendered where they are then.
         readout: frames between the exposures of the first and the last row; 0 for a global shutter.
 
@@ -237,7 +237,7 @@ class Camera:
         return np.stack(rows, axis=1).reshape(-1, 2, 3) @ self._world_to_camera[:3, :3]
 
     def without_delays(self) -> Camera:
-        """Return the same view with images of the instants themselves: no delay and no rolling
+        """Return the same view with images of the timestamps themselves: no delay and no rolling
         shutter.
         """
         return replace(self, delay=0.0, readout=0.0)

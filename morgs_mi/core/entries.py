@@ -26,9 +26,9 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
     "integrators": {"splat_path": "light.splat_path:SplatPathIntegrator"},
     "renderings": {"insert": "light.insert"},
     "layouts": {
-        "dynamic3dgs": "layouts.dynamic3dgs:LAYOUT",
-        "qualisys": "layouts.qualisys:LAYOUT",
-        "anipose": "layouts.anipose:LAYOUT",
+        "dynamic3dgs": "layouts.dynamic3dgs:READER",
+        "qualisys": "layouts.qualisys:READER",
+        "anipose": "layouts.anipose:READER",
     },
     "image checks": {"poses": "calibration.checks.rig_check:pose_problems"},
     "camera refinement": {"first frame": "calibration.refine:refine_cameras"},

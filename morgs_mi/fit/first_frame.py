@@ -72,7 +72,7 @@ def fit_first_frame(
     progress: Progress | None = None,
     on_round: Callable[[Gaussians], None] | None = None,
 ) -> FirstFrame:
-    """Return Gaussians fitted to the images of one instant by L_recon (eq. 2); their confidence
+    """Return Gaussians fitted to the images of one timestamp by L_recon (eq. 2); their confidence
     stays unchanged.
 
     As in 3DGS, the bands of the spherical harmonics are added one after the other. Between a tenth

@@ -1,4 +1,4 @@
-"""The problem of the first frame: the views of one instant, and the Gaussians that a fit to them
+"""The problem of the first frame: the views of one timestamp, and the Gaussians that a fit to them
 starts from.
 """
 
@@ -29,7 +29,7 @@ class FirstFrameProblem:
     """Data to which the first frame is fitted."""
 
     start: Gaussians  #: Initial Gaussians.
-    views: tuple[View, ...]  #: V views of one instant.
+    views: tuple[View, ...]  #: V views of one timestamp.
     points: np.ndarray  #: [P, 3] of the scene, world units, or none.
     #: Of the scene in world units, at least a sixth of its depth: cameras close together see far.
     extent: float

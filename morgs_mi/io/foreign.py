@@ -43,7 +43,7 @@ _FORMATS = (
     _Format("KSPLAT (of GaussianSplats3D)", (".ksplat",)),
     _SOG,
     _Format("LCC (of XGRIDS)", (".lcc",)),
-    _Format("SPLATV (a moving scene in several instants)", (".splatv",), _EXPORT),
+    _Format("SPLATV (a moving scene in several timestamps)", (".splatv",), _EXPORT),
     _Format("a compressed format of Gaussians", (".gsz", ".rad", ".splatz", ".cply"), _EXPORT),
     _GLTF,
     _USD,

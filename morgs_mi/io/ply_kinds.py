@@ -4,7 +4,7 @@
 |---|---|---|
 | discs of 2D Gaussian Splatting | `scale_0` and `scale_1` alone | with a third axis of size 0 |
 | Mip-Splatting, Gaussian Opacity Fields | `filter_3D` | with the filter in sizes and opacities |
-| several instants (Spacetime Gaussians, 4DGS, ...) | varying time or motion | refused |
+| several timestamps (Spacetime Gaussians, 4DGS, ...) | varying time or motion | refused |
 | anchors of Scaffold-GS | `f_offset_*`, `f_anchor_feat_*` | refused |
 
 Properties that are neither read nor known to be harmless are named in a warning.
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 Vertices = dict[str, np.ndarray]
 
-# Instants and durations; all of a file's Gaussians may be of one instant.
+# Timestamps and durations; all of a file's Gaussians may be of one timestamp.
 _TIME = re.compile(
     r"t|time|times|timestamp|instant|frame|frame_?(id|index|idx|number)|t_\w+|time_\w+|mu_?t"
     r"|cov_t.*|scale_?t\w*|sigma_?t|trbf_\w+|duration|life(time|span)"
@@ -57,14 +57,14 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     """
     if vertices.keys().isdisjoint(_GAUSSIAN):
         return vertices
-    # Not all Gaussians of several instants in one file are ever in one image.
+    # Not all Gaussians of several timestamps in one file are ever in one image.
     times = [n for n, v in vertices.items() if _TIME.fullmatch(n) and (v != v[:1]).any()]
     motions = [n for n, v in vertices.items() if _MOTION.fullmatch(n) and (v != 0).any()]
     if evidence := [*times, *motions, *filter(_FOURTH.fullmatch, vertices)]:
         raise ValueError(
-            f"{path}: expected the Gaussians of one instant, got several instants, as of "
+            f"{path}: expected the Gaussians of one timestamp, got several timestamps, as of "
             f"Spacetime Gaussians or 4D Gaussian Splatting ({_listed(evidence)}); export a .ply "
-            "of each instant with the program that trained them, which `morgs-mi import` turns "
+            "of each timestamp with the program that trained them, which `morgs-mi import` turns "
             "into a stream."
         )
     if anchors := [*filter(_ANCHOR.fullmatch, vertices)]:

@@ -47,7 +47,7 @@ _LOG = logging.getLogger(__name__)
 # decoding.
 FAR = 100
 _BEFORE = 32
-# Frames that a clip may pause; the instants of the pause are listed.
+# Frames that a clip may pause; the timestamps of the pause are listed.
 _MAX_PAUSE = 1_000_000
 
 
@@ -454,7 +454,7 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
     """Return the readers of folders of images, aligned by the numbers of their images.
 
     Raises:
-        ValueError: there are far more instants than images.
+        ValueError: there are far more timestamps than images.
     """
     files_by_number = {folder: _images(folder) for folder in folders}
     readers: dict[Clip, FrameReader] = {}
@@ -470,11 +470,11 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
                 f"{file}: expected images numbered without large gaps, got this after "
                 f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
             )
-        instants = range(numbers[0], numbers[-1] + 1, step)
+        timestamps = range(numbers[0], numbers[-1] + 1, step)
         for folder, files in zip(group, clips, strict=True):
             suffix = next(iter(files.values())).suffix
-            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in instants]
-            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=instants)
+            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
+            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
     return readers
 
 

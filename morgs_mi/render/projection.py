@@ -157,7 +157,8 @@ def project(
     if any(c.delay or c.readout for c in cameras) and gaussians.motion is not None:
         _, y, z = _transformed(world, pose)
         row = dr.fma(fy, y / dr.maximum(z, near), cy)
-        late = dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)  # frames after the instant
+        # Frames after the timestamp.
+        late = dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)
         world = [
             v + mi.Float64(late * d)
             for v, d in zip(world, gaussians.rows("motion", rows), strict=True)

@@ -126,7 +126,7 @@ POSES_BOUNDS = {
     ),
     "far offset": (
         none,
-        "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
+        "no timestamp in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
         *("--offset", "cam02", "9"),
     ),
     "gaps and no clip": (

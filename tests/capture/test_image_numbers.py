@@ -33,7 +33,7 @@ def capture_of(path: Path, **cameras: Iterable[int]) -> Path:
 
 
 DIFFERENT = [
-    # numbers of a and b, the common ones, and the interval of the instants in numbers
+    # numbers of a and b, the common ones, and the interval of the timestamps in numbers
     (range(4), range(2, 6), [2, 3], 1),
     (range(10), range(1, 11), range(1, 10), 1),
     ([0, 1], [0, 2], [0], 2),
@@ -53,10 +53,10 @@ def test_align_numbers__are_times(tmp_path: Path, caplog, a, b, common, interval
     assert f"Images with the same number are simultaneous: a {a[0]} to {a[-1]}" in note
     finest = min(a[1] - a[0], b[1] - b[0])
     assert capture.fps == pytest.approx(30 * finest / interval)
-    instants = frame_numbers(load_capture(path, reading=GAPS))
-    assert all(len({number for number in row if number is not None}) <= 1 for row in instants)
+    timestamps = frame_numbers(load_capture(path, reading=GAPS))
+    assert all(len({number for number in row if number is not None}) <= 1 for row in timestamps)
     for camera, numbers in enumerate((a, b, a)):
-        assert [row[camera] for row in instants if row[camera] is not None] == list(numbers)
+        assert [row[camera] for row in timestamps if row[camera] is not None] == list(numbers)
 
 
 @pytest.mark.parametrize(("a", "b", "common", "interval"), DIFFERENT)

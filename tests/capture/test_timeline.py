@@ -28,7 +28,7 @@ def capture_of(path: Path, clips: dict[str, tuple[int, float]], levels: int = 1)
 
 
 def frame_numbers(capture: Capture) -> list[list[int | None]]:
-    """Return per instant the frame of each clip, None for a missing image."""
+    """Return per timestamp the frame of each clip, None for a missing image."""
     frames = capture.partial_frames()
     return [
         [None if image is None else int(image[0, 0, 1]) for image in frame.images]
@@ -37,9 +37,9 @@ def frame_numbers(capture: Capture) -> list[list[int | None]]:
 
 
 @pytest.mark.parametrize(
-    ("clips", "config", "fps", "instants"),
+    ("clips", "config", "fps", "timestamps"),
     [
-        # The instants that both cover.
+        # The timestamps that both cover.
         ({"a": (4, 25), "b": (6, 25)}, ReadConfig(trim=True), 25, [[0, 0], [1, 1], [2, 2], [3, 3]]),
         # b started two frames earlier and ends one frame before a.
         ({"a": (4, 25), "b": (5, 25)}, ReadConfig(offset={"b": 2}), 25, [[0, 2], [1, 3], [2, 4]]),
@@ -56,12 +56,12 @@ def frame_numbers(capture: Capture) -> list[list[int | None]]:
         ({"a": (2, 25), "b": (3, 25)}, ReadConfig(gaps=True), 25, [[0, 0], [1, 1], [None, 2]]),
     ],
 )
-def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, instants) -> None:
+def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, timestamps) -> None:
     capture = load_capture(capture_of(tmp_path / "c", clips), reading=config)
     assert capture.fps == pytest.approx(fps, abs=0.01)
-    assert capture.num_frames == len(instants)
-    assert frame_numbers(capture) == instants
-    assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
+    assert capture.num_frames == len(timestamps)
+    assert frame_numbers(capture) == timestamps
+    assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(timestamps)))
 
 
 def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path)
     assert [camera.delay for camera in capture.cameras] == [0.5, 0]
 
 
-def test_timeline__gives_faster_clips_a_delay_in_instants(tmp_path: Path) -> None:
+def test_timeline__gives_faster_clips_a_delay_in_timestamps(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (5, 25), "b": (5, 50)}, 40)
     capture = load_capture(path, reading=ReadConfig(offset={"b": 0.5}))
     assert frame_numbers(capture) == [[0, 20], [40, 120]]
@@ -116,15 +116,15 @@ def test_timeline__warns_about_images_of_different_times(tmp_path: Path, caplog)
     path = capture_of(tmp_path / "c", {"a": (3, 30), "b": (6, 50)})
     with caplog.at_level(logging.WARNING):
         load_capture(path, reading=ReadConfig(trim=True))
-    # Instant 1 is b's 1.67th frame: a third of its 20 ms from the second.
-    assert "images of one instant are up to 6.7 ms apart" in caplog.text
+    # Timestamp 1 is b's 1.67th frame: a third of its 20 ms from the second.
+    assert "images of one timestamp are up to 6.7 ms apart" in caplog.text
 
 
 RATES = {"a": (300, 30.0), "b": (300, 29.7), "c": (300, 29.97)}
 
 
 def moments(capture: Capture, clips: dict[str, tuple[int, float]]) -> np.ndarray:
-    """Return the times of the images of each instant [T, C] in s; the clips of `capture_of` begin
+    """Return the times of the images of each timestamp [T, C] in s; the clips of `capture_of` begin
     together.
     """
     numbers = np.array(
@@ -149,7 +149,7 @@ def test_timeline__uses_rates_that_are_less_than_a_percent_apart(
     np.testing.assert_allclose(times[:, 1], np.arange(len(times)) / 29.7, atol=1e-3)
     spread = np.ptp(times, axis=1).max()
     assert spread < 1 / 29.7
-    assert f"images of one instant are up to {1e3 * spread:.0f}"[:-1] in caplog.text
+    assert f"images of one timestamp are up to {1e3 * spread:.0f}"[:-1] in caplog.text
 
 
 def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path: Path, caplog) -> None:
@@ -161,7 +161,7 @@ def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path: Pat
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, max_frames=30)
     assert moments(capture, RATES).shape == (30, 3)
-    assert "images of one instant are up to 9.8 ms apart" in caplog.text
+    assert "images of one timestamp are up to 9.8 ms apart" in caplog.text
     (path / "capture.json").write_text('{"fps": 30}')
     assert load_capture(path).num_frames == 300
 
@@ -244,9 +244,9 @@ def timed(path: Path, **times: list[int]) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("times", "config", "instants"),
+    ("times", "config", "timestamps"),
     [
-        # The nearest frame is shown at each instant.
+        # The nearest frame is shown at each timestamp.
         (
             {"a": REGULAR, "b": LATE},
             ReadConfig(trim=True),
@@ -264,7 +264,7 @@ def timed(path: Path, **times: list[int]) -> Path:
             ReadConfig(offset={"b": 1}),
             [[0, 1], [1, 2], [2, 2], [3, 3], [4, 3], [5, 4]],
         ),
-        # a has twice the rate: the instants are b's.
+        # a has twice the rate: the timestamps are b's.
         (
             {"a": [25 * t for t in range(9)], "b": LATE},
             ReadConfig(trim=True),
@@ -274,12 +274,12 @@ def timed(path: Path, **times: list[int]) -> Path:
     ],
 )
 def test_timeline__synchronises_variable_frame_rates_by_time(
-    tmp_path: Path, times, config, instants
+    tmp_path: Path, times, config, timestamps
 ) -> None:
     capture = load_capture(timed(tmp_path / "c", **times), reading=config)
     assert capture.fps == pytest.approx(20, rel=0.01)
-    assert frame_numbers(capture) == instants
-    assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
+    assert frame_numbers(capture) == timestamps
+    assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(timestamps)))
 
 
 def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> None:
@@ -296,12 +296,12 @@ def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path: P
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
     assert load_capture(path, reading=ReadConfig(trim=True)).notes == (
         "b.mp4: variable frame rate, 5 frames in 7 periods of 50.0 ms, up to 0.0 ms off; each "
-        "instant has the frame nearest in time: 2 repeat one, 0 have none.",
+        "timestamp has the frame nearest in time: 2 repeat one, 0 have none.",
     )
     capture = load_capture(path, reading=ReadConfig(gaps=True))
     assert "0 repeat one, 2 have none" in capture.metadata()["notes"][0]
     problems = [frame.problems for frame in capture.partial_frames(3, 4)]
-    assert problems == [(f"b: {path / 'b.mp4'}: no frame at instant 3.",)]
+    assert problems == [(f"b: {path / 'b.mp4'}: no frame at timestamp 3.",)]
     # Rounded, as in Matroska.
     regular = timed(tmp_path / "d", a=REGULAR, b=[50 * t + t % 2 for t in range(7)])
     assert load_capture(regular).notes == ()

@@ -81,7 +81,7 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
 
 
 @pytest.mark.slow
-def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
+def test_fit__and_eval_use_the_same_timestamps(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
     out = tmp_path / "out"
     options = ("--offset", "cam1", "-1", "cam2", "1", "--gaps")

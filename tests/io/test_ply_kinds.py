@@ -53,24 +53,24 @@ SPACETIME = {
     *(f"motion_{i}" for i in range(9)),
     *(f"omega_{i}" for i in range(4)),
 }
-INSTANTS = {
+TIMESTAMPS = {
     "spacetime gaussians": columns(*SPACETIME),
     "4dgs": columns("t", "scale_t", "rot_r_0", "rot_r_1", "rot_r_2", "rot_r_3"),
     "four axes": columns("t", "scale_3", "rot_4", "rot_5", "rot_6", "rot_7"),
     "time": columns("time"),
     "frame": {"frame": np.arange(N, dtype="i4")},
     "velocity": columns("velocity_0", "velocity_1", "velocity_2"),
-    "one instant that moves": {"trbf_center": same(0.5), **columns("omega_0")},
+    "one timestamp that moves": {"trbf_center": same(0.5), **columns("omega_0")},
     "not a number": {"t": same(np.nan)},
 }
 
 
-@pytest.mark.parametrize("kind", INSTANTS)
-def test_read_ply__refuses_several_instants(tmp_path, kind):
-    path = write(tmp_path / "a.ply", **INSTANTS[kind])
+@pytest.mark.parametrize("kind", TIMESTAMPS)
+def test_read_ply__refuses_several_timestamps(tmp_path, kind):
+    path = write(tmp_path / "a.ply", **TIMESTAMPS[kind])
     with pytest.raises(
         ValueError,
-        match=r"a\.ply: expected the Gaussians of one instant, got several instants.*import",
+        match=r"a\.ply: expected the Gaussians of one timestamp, got several timestamps.*import",
     ):
         read_ply(path)
 
@@ -78,7 +78,7 @@ def test_read_ply__refuses_several_instants(tmp_path, kind):
 @pytest.mark.parametrize(
     "more", [{"time": same(3)}, {"frame": np.full(N, 7, "i4")}, {"motion_0": same()}]
 )
-def test_read_ply__reads_gaussians_of_one_instant(tmp_path, more):
+def test_read_ply__reads_gaussians_of_one_timestamp(tmp_path, more):
     assert len(read_ply(write(tmp_path / "a.ply", **more))) == N
 
 

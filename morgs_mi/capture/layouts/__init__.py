@@ -1,1 +1,1 @@
-"""Readers of capture folders, one per layout; `layout_registry.py` lists them."""
+"""Readers of capture folders, one per layout; `reader_registry.py` lists them."""

@@ -1,7 +1,4 @@
-"""Interface of a capture layout, and helpers that the readers share.
-
-A reader module exposes a `Layout`, which `layout_registry.py` lists.
-"""
+"""The reader of a capture layout, and helpers that the readers share."""
 
 from __future__ import annotations
 
@@ -122,8 +119,8 @@ class PoseConvention:
 
 
 @dataclass(frozen=True)
-class Layout:
-    """One way to store a calibration in a capture folder."""
+class Reader:
+    """Reader of one layout, i.e. of one way to store a calibration in a capture folder."""
 
     name: str  #: Name of the layout in reports, e.g. ``COLMAP``.
     #: Names of the files or folders that hold the calibration, for error messages.

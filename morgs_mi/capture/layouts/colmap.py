@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.capture.layouts.calibration import (
     NO_POINTS,
     Calibration,
-    Layout,
+    Reader,
     match_clips,
     required_clips,
 )
@@ -267,6 +267,6 @@ def _read_calibration(path: Path) -> Calibration:
     return replace(match.calibration, points=model.points, point_colors=model.point_colors)
 
 
-LAYOUT = Layout(
+READER = Reader(
     "COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path) is not None, _read_calibration
 )

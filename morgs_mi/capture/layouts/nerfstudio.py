@@ -21,8 +21,8 @@ import numpy as np
 from morgs_mi.capture.layouts.calibration import (
     NO_POINTS,
     Calibration,
-    Layout,
     PoseConvention,
+    Reader,
     match_clips,
     required_clips,
 )
@@ -357,7 +357,7 @@ def _parts(name: str) -> tuple[str, ...]:
     return (place.with_suffix("") if has_suffix else place).parts
 
 
-LAYOUT = Layout(
+READER = Reader(
     "Nerfstudio",
     ("transforms.json",),
     lambda path: (path / "transforms.json").is_file(),

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
+from morgs_mi.capture.layouts.calibration import Calibration, Reader, required_clips
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_array
@@ -130,7 +130,7 @@ def _read_calibration(path: Path) -> Calibration:
     return Calibration(cameras, (Lens(),) * len(cameras), tuple(clips.values()))
 
 
-LAYOUT = Layout(
+READER = Reader(
     "poses_bounds",
     ("poses_bounds.npy",),
     lambda path: (path / "poses_bounds.npy").is_file(),

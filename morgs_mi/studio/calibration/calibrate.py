@@ -277,7 +277,7 @@ def _frames(
     """
     clips = _clips(path, without)
     readers = dict(zip(clips, open_clips([*clips.values()]), strict=True))
-    # The last instant of each clip, in frames of a constant rate.
+    # The last timestamp of each clip, in frames of a constant rate.
     last_frames = {
         name: reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
         for name, reader in readers.items()

@@ -1,4 +1,4 @@
-"""Equations of the time offsets of cameras, from Gaussians of one instant and images of slightly
+"""Equations of the time offsets of cameras, from Gaussians of one timestamp and images of slightly
 different times.
 
 Gaussian k moves by d_k in a frame, which view v shows as m = J_v d_k pixels, with J_v the
@@ -57,7 +57,7 @@ _GROUP = 32
 
 @dataclass(frozen=True, eq=False)
 class OffsetEquations:
-    """S o = r of V views; sums of the equations of several instants are equations again."""
+    """S o = r of V views; sums of the equations of several timestamps are equations again."""
 
     matrix: np.ndarray  #: S [V, V]; the columns of held-out views are zero off the diagonal.
     right: np.ndarray  #: r [V].
@@ -129,12 +129,12 @@ def offset_equations(
     train: np.ndarray,
     blur: float,
 ) -> OffsetEquations:
-    """Return the equations of an instant.
+    """Return the equations of a timestamp.
 
     Args:
-        gaussians: N Gaussians fitted to the instant, with their `motion` in one frame.
+        gaussians: N Gaussians fitted to the timestamp, with their `motion` in one frame.
         views: V views.
-        targets: their images, at about that instant.
+        targets: their images, at about that timestamp.
         train: mask of the views that the Gaussians are fitted to, bool [V].
         blur: standard deviation in pixels of a Gaussian filter of errors and gradients. Offsets
             with displacements up to about this value can be found; 0: no filter.

@@ -1,6 +1,6 @@
 """Time offsets of the cameras of a rig with unsynchronised clocks, from the motion in their images.
 
-At an instant, Gaussians are fitted to the images of all training views, and the flow of the views
+At a timestamp, Gaussians are fitted to the images of all training views, and the flow of the views
 is lifted to their displacement in one frame (see `method.lift`). `offset_equations` gives the
 offsets that explain the remaining error of the images. The images are interpolated at the times
 that these offsets give, and the Gaussians are fitted again. These are Gauss-Newton steps. The first
@@ -48,11 +48,11 @@ from morgs_mi.studio.calibration.offset_equations import UNKNOWN, OffsetEquation
 # px, least width of the images: small images are fitted fast, and an offset displaces them by few
 # pixels.
 _WIDTH = 160
-# Number of frames used from the start of the recording, and of instants among them at which
+# Number of frames used from the start of the recording, and of timestamps among them at which
 # Gaussians are fitted.
 _FRAMES = 12
-_INSTANTS = 2
-# Gaussians and steps of the fit at an instant; half as many of both for blurred images.
+_TIMESTAMPS = 2
+# Gaussians and steps of the fit at a timestamp; half as many of both for blurred images.
 GAUSSIANS = 8000
 STEPS = 600
 # Standard deviations in pixels of the filters of the first rounds, one round each.
@@ -122,8 +122,9 @@ def estimate_time_offsets(
             f"{clips.path}: expected at least 4 frames to compare clocks, got "
             f"{clips.num_frames}; record longer."
         )
-    instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
-    rounds = _Rounds(clips, instants, seed, progress)
+    last = clips.num_frames - 2 - largest
+    timestamps = np.linspace(largest, last, _TIMESTAMPS).round().astype(int)
+    rounds = _Rounds(clips, timestamps, seed, progress)
     offsets, step, equations = _aligned(rounds, largest)
     reference = capture.reference_view
     part = _found_back(rounds, offsets - step, equations, reference)
@@ -190,22 +191,22 @@ class _Rounds:
     """Fits of successive rounds."""
 
     clips: _Clips  # images to fit
-    instants: np.ndarray  # frames at which Gaussians are fitted
+    timestamps: np.ndarray  # frames at which Gaussians are fitted
     seed: int  # seed of all fits
     progress: Callable[[int, int], None] | None  # called with (fits done, fits at most), or None
     done: int = 0  # number of completed fits
 
     def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
-        """Return the sum of the equations of all instants, with images interpolated by offsets [V]
-        and blurred.
+        """Return the sum of the equations of all timestamps, with images interpolated by offsets
+        [V] and blurred.
         """
         parts = []
-        for instant in self.instants:
-            parts.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
+        for timestamp in self.timestamps:
+            parts.append(_equations_at(self.clips, timestamp - offsets, blur, self.seed))
             self.done += 1
             if self.progress is not None:
                 # There are fewer fits if a round is left out.
-                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
+                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.timestamps))
         equations = reduce(add, parts)
         if not equations.own.any():
             raise ValueError(
@@ -273,7 +274,7 @@ class _Clips:
 
 
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
-    """Return the equations of an instant, which each view shows at its own time [V]."""
+    """Return the equations of a timestamp, which each view shows at its own time [V]."""
     images = clips.at(times)
     next_images = clips.at(times + 1)
     pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
@@ -287,7 +288,7 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> O
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
-    """Return Gaussians fitted to the images of the training views at one instant.
+    """Return Gaussians fitted to the images of the training views at one timestamp.
 
     Args:
         clips: cameras and points of the fit.

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.layouts.calibration import (
     Calibration,
-    Layout,
+    Reader,
     calibration_files,
     match_clips,
     only_calibration,
@@ -159,6 +159,6 @@ def _read_calibration(path: Path) -> Calibration:
     return match_clips(path, source, required_clips(path), cameras, lenses).calibration
 
 
-LAYOUT = Layout(
+READER = Reader(
     "Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration
 )

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Layout
+from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Reader
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_array, read_json
 from morgs_mi.core.camera import Camera, rigid
@@ -166,7 +166,7 @@ def _read_calibration(path: Path) -> Calibration:
     return Calibration(cameras, (Lens(),) * len(rig), clips, points, colors, test_views or None)
 
 
-LAYOUT = Layout(
+READER = Reader(
     "Dynamic 3D Gaussians",
     ("train_meta.json",),
     lambda path: (path / "train_meta.json").is_file(),

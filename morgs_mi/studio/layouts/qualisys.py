@@ -24,8 +24,8 @@ import numpy as np
 
 from morgs_mi.capture.layouts.calibration import (
     Calibration,
-    Layout,
     PoseConvention,
+    Reader,
     calibration_files,
     match_clips,
     only_calibration,
@@ -196,7 +196,7 @@ def _read_calibration(path: Path) -> Calibration:
     return match_clips(path, source, required_clips(path), cameras, lenses).calibration
 
 
-LAYOUT = Layout(
+READER = Reader(
     "Qualisys",
     ("*.qca.txt",),
     lambda path: bool(calibration_files(path, _PATTERN)),

@@ -15,7 +15,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.capture.layouts.layout_registry import find_layout
+from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.fit_names import CAPTURE
@@ -38,7 +38,7 @@ def read_calibration(folder: Path) -> Calibration:
         raise FileNotFoundError(
             f"{folder}: expected a calibrated capture of the cameras, found none; check the path."
         )
-    calibration = find_layout(folder).read(folder)
+    calibration = find_reader(folder).read(folder)
     if any(calibration.masks):
         _LOG.warning("%s: its masks are not used by a live fit.", folder)
     return calibration

@@ -4,7 +4,7 @@ A source yields the images of one camera, at the size of its recorded clip:
 
 - an int: a camera of this machine, by OpenCV's index;
 - a path or URL: anything that FFmpeg opens, e.g. ``/dev/video0`` or ``rtsp://...``;
-- an iterable of arrays uint8 [H, W, 3], RGB, with None for a missed instant.
+- an iterable of arrays uint8 [H, W, 3], RGB, with None for a missed timestamp.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.layouts import layout_registry
-from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
+from morgs_mi.capture.layouts import reader_registry
+from morgs_mi.capture.layouts.calibration import Calibration, Reader, required_clips
 from morgs_mi.capture.layouts.clips import clips_by_camera, photos
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
@@ -136,7 +136,7 @@ def test_colmap__finds_models_in_several_places(tmp_path: Path, place: str) -> N
     assert_holds(load_capture(tmp_path / "a"), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
-def test_find_layout__follows_the_order_of_precedence(tmp_path: Path) -> None:
+def test_find_reader__follows_the_order_of_precedence(tmp_path: Path) -> None:
     """COLMAP, Nerfstudio, Dynamic 3D Gaussians, poses_bounds; binary before text."""
     path = layouts.nerfstudio(tmp_path / "a")
     write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
@@ -245,10 +245,10 @@ def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
         load_capture(tmp_path / "stream.morgs")
 
 
-def test_find_layout__finds_a_layout_that_is_added(
+def test_find_reader__finds_a_layout_that_is_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new layout costs its `Layout` and an entry in `LAYOUTS`."""
+    """A new layout costs its `Reader` and an entry in `READERS`."""
     names = ("cam1", "cam2", "cam10")
     path = tmp_path / "a"
 
@@ -256,8 +256,8 @@ def test_find_layout__finds_a_layout_that_is_added(
         clips = required_clips(path)
         return Calibration(tuple(rig(tuple(clips))), (Lens(),) * len(clips), tuple(clips.values()))
 
-    toy = Layout("toy", ("toy.txt",), lambda path: (path / "toy.txt").is_file(), read)
-    monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
+    toy = Reader("toy", ("toy.txt",), lambda path: (path / "toy.txt").is_file(), read)
+    monkeypatch.setattr(reader_registry, "READERS", (*reader_registry.READERS, toy))
     layouts.videos(path, names)
     with pytest.raises(
         FileNotFoundError, match=r"sparse/0, sparse, .*, poses_bounds.npy or toy.txt\), found none"
@@ -372,17 +372,17 @@ def test_dynamic3dgs__holds_out_all_test_cameras(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = split_meta(layouts.dynamic3dgs(tmp_path / "a"), train_meta=(1,), test_meta=(10, 2))
-    calibration = layout_registry.find_layout(path).read(path)
+    calibration = reader_registry.find_reader(path).read(path)
     assert (calibration.names, calibration.test_views) == (("1", "2", "10"), (1, 2))
     assert load_capture(path).test_views == (1, 2)
     assert load_capture(path, test_view=None).test_views == ()
     assert load_capture(path, reading=ReadConfig(without=("2",))).test_views == (1,)
     shutil.rmtree(path / "ims" / "2")
-    assert layout_registry.find_layout(path).read(path).test_views == (1,)
+    assert reader_registry.find_reader(path).read(path).test_views == (1,)
     assert "no image of 2 was found: left out" in caplog.text
     # Which is trained on, too.
     path = split_meta(layouts.dynamic3dgs(tmp_path / "b"), test_meta=(10,))
-    assert layout_registry.find_layout(path).read(path).test_views == (2,)
+    assert reader_registry.find_reader(path).read(path).test_views == (2,)
 
 
 JUNK = (

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.layouts.nerfstudio import LAYOUT
+from morgs_mi.capture.layouts.nerfstudio import READER
 from tests.assertions import assert_close
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
@@ -165,7 +165,7 @@ def test_nerfstudio__holds_out_the_views_of_its_splits(
     tmp_path: Path, lists: dict, views: tuple[int, ...]
 ) -> None:
     path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
-    assert LAYOUT.read(path).test_views == views
+    assert READER.read(path).test_views == views
     assert load_capture(path).test_views == views
     assert load_capture(path, test_view=None).test_views == ()
 

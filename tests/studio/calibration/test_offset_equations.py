@@ -89,7 +89,7 @@ def test_solution__adds_what_the_fit_hides() -> None:
     np.testing.assert_allclose(system.solution(share=0.5), 2 * system.solution())
 
 
-def test_sum__is_between_its_instants() -> None:
+def test_sum__is_between_its_timestamps() -> None:
     ball = turning_ball()
     both = equations(ball) + equations(ball, 0 * OFFSETS)
     np.testing.assert_allclose(both.solution(), OFFSETS / 2, atol=0.05)

@@ -48,7 +48,7 @@ def test_live_frames__process_iterators_and_files_like_clips(rig: Capture) -> No
     assert_as_recorded(rig, live_frames(rig, [iter(clip()), clip(), rig.path / "cam3.mkv"]))
 
 
-def test_live_frames__leave_out_a_source_that_misses_an_instant_or_ends(rig: Capture) -> None:
+def test_live_frames__leave_out_a_source_that_misses_a_timestamp_or_ends(rig: Capture) -> None:
     a, b, c = clip()
     frames = list(live_frames(rig, [[a, None, c], [a, b], clip()]))
     assert [[image is not None for image in frame.images] for frame in frames] == [

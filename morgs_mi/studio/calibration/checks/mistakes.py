@@ -16,7 +16,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts import poses_bounds
 from morgs_mi.capture.layouts.calibration import PoseConvention
-from morgs_mi.capture.layouts.layout_registry import layout_called
+from morgs_mi.capture.layouts.reader_registry import reader_called
 from morgs_mi.core.camera import Camera
 
 # A camera or the cameras of a rig.
@@ -82,7 +82,7 @@ def rig_candidates(
         wrong: the views with poses that do not fit; their order may be wrong.
     """
     cameras = capture.cameras
-    if capture.layout == poses_bounds.LAYOUT.name:
+    if capture.layout == poses_bounds.READER.name:
         alphabetical = sorted(capture.names)
         order = ", ".join(alphabetical[:4])
         yield (
@@ -96,8 +96,8 @@ def rig_candidates(
             "right, backward",
         )
     else:
-        layout = layout_called(capture.layout)
-        poses = layout.poses if layout else PoseConvention()
+        reader = reader_called(capture.layout)
+        poses = reader.poses if reader else PoseConvention()
         yield from _other_conventions(cameras, poses) if poses else ()
     if len(cameras) <= _MAX_EXCHANGED:
         for i, j in combinations(range(len(cameras)), 2):

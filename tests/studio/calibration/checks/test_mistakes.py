@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.features import match_views
-from morgs_mi.capture.layouts import layout_registry
+from morgs_mi.capture.layouts import reader_registry
 from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.capture.points import MAX_ERROR, SharedFeatures, match_capture
@@ -60,9 +60,9 @@ def test_check_rig__names_another_pose_convention(
 ) -> None:
     """Each of the four conventions is read as the one that the layout expects."""
     expected = EXPECTED[layout]
-    toy = replace(layout_registry.LAYOUTS[0], name=layout, poses=PoseConvention(*expected))
+    toy = replace(reader_registry.READERS[0], name=layout, poses=PoseConvention(*expected))
     if layout.startswith("toy"):
-        monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
+        monkeypatch.setattr(reader_registry, "READERS", (*reader_registry.READERS, toy))
     cameras = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
     read = with_cameras(
         replace(capture, layout=layout), lambda i, c: replace(c, viewmat=cameras[i])

@@ -1,7 +1,6 @@
-"""The supported capture layouts.
+"""Readers of the supported capture layouts.
 
-A layout is a module that exposes a `LAYOUT`. A module outside of this package appends it to
-`LAYOUTS`.
+A module of this folder exposes its `READER`; one outside of this package appends it to `READERS`.
 """
 
 from __future__ import annotations
@@ -10,30 +9,30 @@ from contextlib import suppress
 from pathlib import Path
 
 from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
-from morgs_mi.capture.layouts.calibration import Layout, required_clips
+from morgs_mi.capture.layouts.calibration import Reader, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.fit_names import CAPTURE, STREAM
 
-LAYOUTS: list[Layout] = [
-    colmap.LAYOUT,
-    nerfstudio.LAYOUT,
+READERS: list[Reader] = [
+    colmap.READER,
+    nerfstudio.READER,
     *(studio_entry("layouts", name) for name in STUDIO["layouts"]),
-    poses_bounds.LAYOUT,
+    poses_bounds.READER,
 ]
-"""The layouts in order of precedence, for folders with several calibrations. COLMAP's is the most
+"""The readers in order of precedence, for folders with several calibrations. COLMAP's is the most
 complete one: it has lenses, principal points and points. `poses_bounds.npy` has none of them."""
 
 
-def find_layout(path: Path) -> Layout:
-    """Return the first layout with a calibration in the capture folder `path`.
+def find_reader(path: Path) -> Reader:
+    """Return the first reader that finds a calibration in the capture folder `path`.
 
     Raises:
         FileNotFoundError: there is no calibration.
     """
-    if layout := next((layout for layout in LAYOUTS if layout.find(path)), None):
-        return layout
+    if reader := next((reader for reader in READERS if reader.find(path)), None):
+        return reader
     if (path / STREAM).is_file():
         description = None
         with suppress(OSError, ValueError):
@@ -50,13 +49,13 @@ def find_layout(path: Path) -> Layout:
     recording = (
         f" The {len(clips)} photos count as cameras with one frame each; a recording has {EXAMPLE}"
     )
-    *files, last = [file for layout in LAYOUTS for file in layout.files]
+    *files, last = [file for reader in READERS for file in reader.files]
     raise FileNotFoundError(
         f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run "
         f"`morgs-mi calibrate` on the folder.{recording if static else ''}"
     )
 
 
-def layout_called(name: str) -> Layout | None:
-    """Return the layout with this name, or None."""
-    return next((layout for layout in LAYOUTS if layout.name == name), None)
+def reader_called(name: str) -> Reader | None:
+    """Return the reader of the layout with this name, or None."""
+    return next((reader for reader in READERS if reader.name == name), None)
