@@ -25,15 +25,10 @@ class CameraSource:
     reader: FrameReader  #: Reader of the clip.
     lens: Lens  #: The lens that the clip was recorded through.
     undistortion: Undistortion | None  #: The pixel maps that remove the lens distortion, or None.
-    #: The clip's frames that show the timestamps 0, 1, ... of the recording, -1 for none, int [T].
-    frame_indices: np.ndarray
-    #: The share of the time to the clip's next frame that has passed at each timestamp [T]; None:
-    #: none has.
-    shares: np.ndarray | None = None
+    times: ClipTimes  #: The clip's frames that show the timestamps of the recording.
     #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None
     #: if all are.
     recorded_mask: np.ndarray | None = None
-    delay: float = 0.0  #: Time from a timestamp to the frame that shows it, in frames of the clip.
     #: Stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
     display_exposure: float | None = None
     notes: tuple[str, ...] = ()  #: Sentences on its masks.
@@ -61,35 +56,23 @@ class CameraSource:
             ValueError: a mask cannot be read, or no pixel is left.
         """
         mask, notes = used_in_clip(reader, masks, camera.name)
-        return cls(
-            reader,
-            lens,
-            undistortion(camera, lens),
-            times.frame_indices,
-            times.shares,
-            recorded_mask=mask,
-            delay=times.delay,
-            notes=tuple(notes),
-        )
+        return cls(reader, lens, undistortion(camera, lens), times, mask, notes=tuple(notes))
 
     def at_timestamps(self) -> CameraSource:
         """Return the source without a delay: its images are interpolated instead."""
-        if not self.delay:
-            return self
-        positions = self.frame_indices - self.delay
+        positions = self.times.frame_indices - self.times.delay
         indices = np.floor(positions).astype(int)
-        return replace(self, frame_indices=indices, shares=positions - indices, delay=0.0)
+        times = ClipTimes(indices, positions - indices, 0.0, self.times.rate)
+        return replace(self, times=times)
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the timestamps start..stop-1, with an error in place of a
         missing image.
         """
-        if self.shares is not None:
-            yield from self._interpolated(
-                camera, self.frame_indices[start:stop], self.shares[start:stop]
-            )
+        indices = self.times.frame_indices[start:stop]
+        if self.times.shares is not None:
+            yield from self._interpolated(camera, indices, self.times.shares[start:stop])
             return
-        indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
         for timestamp, index in enumerate(indices, start):
             if index < 0:

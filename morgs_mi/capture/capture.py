@@ -236,7 +236,7 @@ class Capture:
             "cameras": [
                 {
                     "name": camera.name,
-                    "first_frame": int(source.frame_indices[0]),
+                    "first_frame": int(source.times.frame_indices[0]),
                     "recorded_size": [source.reader.width, source.reader.height],
                     "size": [camera.width, camera.height],
                     "K": camera.K.tolist(),
@@ -315,7 +315,7 @@ class Capture:
                 )
                 problems = tuple(f"{name}: {error}" for name, error in errors.items())
                 recorded = None
-                if index == 0 and any(source.delay for source in self._sources):
+                if index == 0 and any(source.times.delay for source in self._sources):
                     recorded = images
                     images = self._at_first_timestamp(images)
                 yield PartialFrame(index, images, problems, recorded, unread)
@@ -333,7 +333,7 @@ class Capture:
         """
         first_images = list(images)
         for view, source in enumerate(self._sources):
-            if first_images[view] is not None and source.delay:
+            if first_images[view] is not None and source.times.delay:
                 result = next(source.at_timestamps().images(self.cameras[view], 0, 1))
                 if isinstance(result, np.ndarray):
                     first_images[view] = result

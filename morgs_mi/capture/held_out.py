@@ -64,8 +64,7 @@ def held_out_views(
     indices = _indices(path, views, names)
     if len(indices) == len(names):
         raise ValueError(
-            f"{path}: `test_view` must leave a camera for training, got all {len(names)} cameras; "
-            "name fewer of them."
+            f"{path}: `test_view` must leave a camera for training, got all {len(names)} cameras."
         )
     return indices
 
@@ -77,11 +76,11 @@ def _indices(
     if views is None:
         return ()
     indices = set()
-    for view in [views] if isinstance(views, int | str) else views:
+    for view in views if isinstance(views, list | tuple) else [views]:
         if view in names:
             indices.add(names.index(view))
-        elif str(view).isdecimal() and int(view) < len(names):
-            indices.add(int(view))
+        elif str(view).isdecimal() and int(str(view)) < len(names):
+            indices.add(int(str(view)))
         else:
             raise ValueError(
                 f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "

@@ -50,8 +50,8 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
     """Split a COLMAP camera's parameters into the lens and K [3, 3].
 
     Raises:
-        ValueError: the model is not supported, or the number of parameters does not match the
-            model.
+        ValueError: the model is not supported, or the parameters are not finite or do not match
+            its number of them.
     """
     if model not in MODELS:
         raise ValueError(
@@ -60,15 +60,10 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
         )
     focals, coefficients = MODELS[model]
     count = 2 + focals + coefficients
-    if len(params) != count:
+    if len(params) != count or not bounded(params):
         raise ValueError(
-            f"the camera model {model} takes {count} parameters, got {len(params)}; write the "
-            "model again."
-        )
-    if not bounded(params):
-        raise ValueError(
-            f"its parameters must be finite and at most {LARGEST:g}, got {[*params]}; calibrate "
-            "again."
+            f"the camera model {model} takes {count} parameters of at most {LARGEST:g}, got "
+            f"{len(params)}: {[*params][:count]}; calibrate again."
         )
     fx = params[0]
     fy = params[focals - 1]

@@ -5,46 +5,70 @@ them out.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from morgs_mi.io.exr import opaque_light
+from morgs_mi.io.listing import existing_file
 from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
 
 def used_in_clip(
-    reader: FrameReader, masks: Sequence[Path], name: str
+    reader: FrameReader, files: Sequence[Path], name: str
 ) -> tuple[np.ndarray | None, list[str]]:
     """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all
     are, and notes.
 
+    Args:
+        reader: of the clip.
+        files: masks of the size of the clip, or scaled versions of it.
+        name: name of the camera.
+
     Raises:
         FileNotFoundError: a mask is missing.
-        ValueError: a mask cannot be read, or no pixel is left.
+        ValueError: a mask cannot be read or has another aspect ratio, or no pixel is left.
     """
-    opaque, *notes = opaque_pixels(reader, name)
-    mask, note = used_pixels(masks, reader.width, reader.height, name)
-    if mask is None:
-        mask = opaque
-    elif opaque is not None:
-        mask = mask & opaque
-    if mask is not None and not mask.any():
+    opaque, note = opaque_pixels(reader, name)
+    notes = [note] if note else []
+    width = reader.width
+    height = reader.height
+    used = np.ones((height, width), bool)
+    varies = False  # whether a later image masks out more than those before it
+    for file in files:
+        existing_file(file, "a mask", "copy it, or drop `mask_path`")
+        image = np.atleast_3d(decode_image(file, cv2.IMREAD_UNCHANGED)) > 0
+        # Neither black nor transparent.
+        mask = np.any(image[..., :3], axis=2) & np.all(image[..., 3:], axis=2)
+        rows, columns = mask.shape
+        if abs(columns * height - rows * width) > min(columns, rows, width, height):
+            raise ValueError(
+                f"{file}: expected a mask of {width}x{height} pixels, or a scaled version of it, "
+                f"got {columns}x{rows}; make it again."
+            )
+        mask = scaled_mask(mask, width, height)
+        varies = varies or (file != files[0] and bool((used & ~mask).any()))
+        used &= mask
+    if not used.all():
+        several = f": all that any of {len(files)} different masks has black"
+        origin = several if varies else f" by {files[0].name}"
+        notes.append(f"{name}: {_unused(used)} % of its pixels are masked out{origin}.")
+    if opaque is not None:
+        used &= opaque
+    if not used.any():
         raise ValueError(
-            f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct "
-            "it."
+            f"{files[0] if files else reader.path}: expected pixels of {name} that are used, got "
+            "all black or transparent; correct the mask."
         )
-    return mask, [text for text in (*notes, note) if text]
+    return None if used.all() else used, notes
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
     """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and a note.
 
     The first, the middle and the last image are compared.
-
-    Raises:
-        ValueError: no pixel is opaque.
     """
     if not isinstance(reader, FolderReader):
         return None, ""
@@ -55,58 +79,7 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
         return None, f"{name}: the alpha channel of its images changes over time and is ignored."
     if mask.all():
         return None, ""
-    if not mask.any():
-        raise ValueError(
-            f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it."
-        )
     return mask, f"{name}: {_unused(mask)} % of its pixels are transparent and masked out."
-
-
-def used_pixels(
-    files: Sequence[Path], width: int, height: int, name: str
-) -> tuple[np.ndarray | None, str]:
-    """Return the mask [H, W] of the pixels that are black in no image, None if there are none, and
-    a note.
-
-    Args:
-        files: images of one camera, of the size of its clip or scaled versions of it.
-        width: of the clip, px.
-        height: of the clip, px.
-        name: name of the camera.
-
-    Raises:
-        FileNotFoundError: an image is missing.
-        ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked
-            out.
-    """
-    used_mask = np.ones((height, width), bool)
-    varies = False  # whether a later image masks out more than those before it
-    for file in files:
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"{file}: expected a mask, found none; copy it, or drop `mask_path`."
-            )
-        image = np.atleast_3d(decode_image(file, cv2.IMREAD_UNCHANGED)) > 0
-        # Neither black nor transparent.
-        mask = np.any(image[..., :3], axis=2) & np.all(image[..., 3:], axis=2)
-        rows, columns = mask.shape
-        if abs(columns * height - rows * width) > min(columns, rows, width, height):
-            raise ValueError(
-                f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled "
-                f"version of it, got {columns}x{rows}; make it again."
-            )
-        mask = scaled_mask(mask, width, height)
-        varies = varies or (file != files[0] and bool((used_mask & ~mask).any()))
-        used_mask &= mask
-    if used_mask.all():
-        return None, ""
-    if not used_mask.any():
-        raise ValueError(
-            f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it."
-        )
-    several = f": all that any of {len(files)} different masks has black"
-    origin = several if varies else f" by {files[0].name}"
-    return used_mask, f"{name}: {_unused(used_mask)} % of its pixels are masked out{origin}."
 
 
 def _unused(mask: np.ndarray) -> str:
@@ -118,11 +91,11 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is
     not readable.
     """
-    try:
+    with suppress(ValueError, OSError):
         mask = _opaque_in_file(file)
-    except (ValueError, OSError):
-        mask = None
-    return np.ones(shape, bool) if mask is None or mask.shape != shape else mask
+        if mask is not None and mask.shape == shape:
+            return mask
+    return np.ones(shape, bool)
 
 
 def _opaque_in_file(file: Path) -> np.ndarray | None:

@@ -149,9 +149,8 @@ def _timestamps(
     if drift > _NEAR:
         rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {rates}; images of one index "
-            f"are up to {drift:.1f} frames apart; use the lowest rate with --trim, or set the "
-            "true one as `fps` in capture.json."
+            f"{path}: all cameras must have the same frame rate, got {rates}, up to {drift:.1f} "
+            "frames apart; use the lowest one with --trim, or set `fps` in capture.json."
         )
     timestamps = np.arange(num_frames, dtype=float)
     return replace(exact, rates=np.ones(len(readers))), timestamps
@@ -323,9 +322,8 @@ def _check_complete(reader: FrameReader, required: int) -> None:
     if required > reader.num_held:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the "
-            f"file is truncated or broken; copy it again, use the first {reader.num_held} frames "
-            "(`max_frames`), or leave its camera out, of the later frames (--gaps) or of all "
-            "(--without)."
+            "file is truncated or broken; copy it again, use the frames before it (`max_frames`), "
+            "or leave its camera out, of the later frames (--gaps) or of all (--without)."
         )
 
 
@@ -339,10 +337,9 @@ def _check_even(reader: FrameReader, required: int) -> None:
     frame = int(np.argmax(np.abs(late) > _NEAR))
     if abs(late[frame]) > _NEAR:
         raise ValueError(
-            f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
-            f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms "
-            f"{'late' if late[frame] > 0 else 'early'}; use the frames nearest in time (--trim), "
-            "leave the camera out where it has none (--gaps), or convert the clip."
+            f"{reader.path}: expected a constant frame rate, got frame {frame} "
+            f"{1e3 * late[frame] / reader.fps:.0f} ms late; use the frames nearest in time "
+            "(--trim), leave the camera out where it has none (--gaps), or convert the clip."
         )
 
 
@@ -364,8 +361,8 @@ def _num_frames(
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "
-            f"frames with `max_frames={shortest}`, the timestamps that all clips cover with "
-            "--trim, align the clips with --offset, or leave cameras out with --without."
+            f"with `max_frames={shortest}`, those that all clips cover with --trim, align the "
+            "clips with --offset, or leave cameras out with --without."
         )
     return shortest
 
@@ -384,9 +381,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         return {}
     settings = read_json(path)
     if not isinstance(settings, dict):
-        raise ValueError(
-            f"{path}: expected a JSON object, got {type(settings).__name__}; correct it."
-        )
+        raise ValueError(f"{path}: expected a JSON object, got another value; correct it.")
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
     for name, interval in _INTERVALS.items():
@@ -395,11 +390,4 @@ def read_settings(path: Path) -> dict[str, Any]:
     readout = settings.get("readout", 0.0)
     for value in readout.values() if isinstance(readout, dict) else [readout]:
         check_number(str(path), "readout", value, "[-1, 1]")
-    view = settings.get("test_view")
-    indices = view if isinstance(view, list) else [view]
-    if view is not None and any(type(index) is not int for index in indices):
-        raise ValueError(
-            f"{path}: `test_view` must be a camera's index, a list of them, or null, got "
-            f"{view!r}; correct it."
-        )
     return settings

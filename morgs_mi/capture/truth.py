@@ -16,6 +16,9 @@ import numpy as np
 
 from morgs_mi.core.bounded import array_names, read_array
 from morgs_mi.io.exr import read_exr, write_exr
+from morgs_mi.io.listing import existing_file
+
+_CHANNELS = ("motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y")
 
 
 @dataclass(frozen=True)
@@ -60,14 +63,8 @@ def save_truth(folder: str | Path, camera: str, frame: int, truth: GroundTruth) 
     """
     path = _path(folder, camera, frame)
     path.parent.mkdir(parents=True, exist_ok=True)
-    channels = {
-        "motion.X": truth.motion[..., 0],
-        "motion.Y": truth.motion[..., 1],
-        "depth.Y": truth.depth,
-        "id.Y": truth.ids,
-        "mask.Y": truth.mask,
-    }
-    write_exr(path, channels)
+    values = (truth.motion[..., 0], truth.motion[..., 1], truth.depth, truth.ids, truth.mask)
+    write_exr(path, dict(zip(_CHANNELS, values, strict=True)))
 
 
 def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
@@ -80,18 +77,14 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     """
     path = _path(folder, camera, frame)
     channels = read_exr(path)
-    missing = {"motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y"} - channels.keys()
-    if missing:
+    try:
+        x, y, depth, ids, mask = (channels[name] for name in _CHANNELS)
+    except KeyError as error:
         raise ValueError(
-            f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesise the capture "
-            "again."
-        )
-    return GroundTruth(
-        np.stack([channels["motion.X"], channels["motion.Y"]], axis=-1),
-        channels["depth.Y"],
-        channels["id.Y"].astype(np.int32),
-        channels["mask.Y"] > 0.5,
-    )
+            f"{path}: expected the channels {', '.join(_CHANNELS)}, got none called {error}; "
+            "synthesise the capture again."
+        ) from None
+    return GroundTruth(np.stack([x, y], axis=-1), depth, ids.astype(np.int32), mask > 0.5)
 
 
 def load_tracks(folder: str | Path) -> Tracks:
@@ -101,11 +94,8 @@ def load_tracks(folder: str | Path) -> Tracks:
         FileNotFoundError: the folder has none.
         ValueError: the file is broken.
     """
-    path = Path(folder) / "tracks.npz"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"load_tracks(): there is no file {path}; pass the truth folder of a synthetic capture."
-        )
+    kind = "the tracks of a synthetic capture"
+    path = existing_file(Path(folder) / "tracks.npz", kind, "pass its truth folder")
     points = read_array(path, "points")
     ids = read_array(path, "ids")
     prefix = "visible_"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from numbers import Real
 from typing import Any
 
@@ -11,6 +13,19 @@ from numpy.typing import ArrayLike
 
 LARGEST = 1e12
 """Largest coordinate or coefficient that is read, in its own unit: its cube is still a float32."""
+
+
+@contextmanager
+def errors_at(place: str) -> Iterator[None]:
+    """Prefix the errors of values with their place, such as a file and a row.
+
+    Raises:
+        ValueError: a value is broken.
+    """
+    try:
+        yield
+    except (TypeError, ValueError, IndexError, OverflowError) as error:
+        raise ValueError(f"{place}: {error}") from None
 
 
 def bounded(values: ArrayLike) -> bool:
@@ -103,6 +118,12 @@ def check_mask(place: str, mask: Any, height: int, width: int) -> None:
         kind_of(mask),
         "resize it without interpolation, or compare it with a threshold",
     )
+
+
+def few(names: Sequence[Any] | np.ndarray, most: int = 10) -> str:
+    """Return the first of some names in words."""
+    rest = len(names) - most
+    return ", ".join(map(str, names[:most])) + (f" and {rest} more" if rest > 0 else "")
 
 
 def kind_of(value: Any) -> str:

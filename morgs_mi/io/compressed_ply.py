@@ -21,18 +21,17 @@ of its range, but 0 and 255 stand for its ends.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.special import expit
 
+from morgs_mi.core.checks import few
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
-from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
 
 _CHUNK = 256
@@ -103,49 +102,51 @@ def _chunks(raw: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarra
     return chunks, fractions
 
 
-def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
+def read_compressed_ply(path: str | Path) -> Gaussians:
     """Return the Gaussians in a compressed PLY file of any tool, SH of degree 0 to 3.
 
     Opacities are clipped to [1e-6, 1 - 1e-6], as in `Gaussians.from_activated`.
 
-    Args:
-        path: the file.
-        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0:
-            none.
-
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, is truncated, lacks a property, or has more invalid
-            Gaussians.
+        ValueError: it is not a PLY file, is truncated, or lacks a property.
     """
     elements = read_elements(path, ("chunk", "vertex"), ("sh",))
     chunks = elements["chunk"]
     vertices = elements["vertex"]
     rest = elements.get("sh", {})
-    _check_columns(path, "vertex", vertices, _PACKED, "<u4")
-    N = len(vertices["packed_position"])
-    num_chunks = len(next(iter(chunks.values()), ()))
-    if num_chunks != -(-N // _CHUNK):
-        raise ValueError(
-            f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got "
-            f"{num_chunks}; the file is broken, export it again."
-        )
-    if len(rest) not in SH_DEGREES or any(len(column) != N for column in rest.values()):
-        raise ValueError(
-            f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) "
-            f"or none, got {len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; "
-            "the file is broken, export it again."
-        )
     K = 1 + len(rest) // 3
-    _check_columns(path, "sh", rest, rest_names(K), "u1")
+    has_colors = "min_r" in chunks  # older writers have no bounds of the colours
+    bounds = [names for key in _BOUNDS if key != "color" or has_colors for names in _BOUNDS[key]]
+    types = {
+        **dict.fromkeys(_PACKED, "u4"),
+        **dict.fromkeys([name for names in bounds for name in names], "f4"),
+        **dict.fromkeys(rest_names(K), "u1"),
+    }
+    stored_types = {name: v.dtype.str[1:] for name, v in (chunks | vertices | rest).items()}
+    N, num_chunks, num_sh = (len(next(iter(e.values()), ())) for e in (vertices, chunks, rest))
+    faults = [
+        f"no {name} of type {kind}"
+        for name, kind in types.items()
+        if stored_types.get(name) != kind
+    ]
+    if num_chunks != -(-N // _CHUNK):
+        faults.append(f"{num_chunks} chunks")
+    if len(rest) not in SH_DEGREES or (rest and num_sh != N):
+        faults.append(f"{num_sh} rows of {len(rest)} SH coefficients")
+    if faults:
+        raise ValueError(
+            f"{path}: expected a compressed PLY of {N} Gaussians, chunks of {_CHUNK} and SH of "
+            f"degree 0 to 3, got {few(faults)}; export it again."
+        )
     position, scale = (
-        _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
+        _between(chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
         for key in ("position", "scale")
     )
     color = _unpacked(vertices["packed_color"], _COLOR_BITS)
     base = color[:, :3]
-    if "min_r" in chunks:
-        base = _between(path, chunks, "color", base)
+    if has_colors:
+        base = _between(chunks, "color", base)
     coeffs = np.empty((N, K, 3), np.float32)
     coeffs[:, 0] = (base - 0.5) / SH_C0
     if rest:
@@ -155,8 +156,7 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
         coeffs[:, 1:] = (parts / 128 - 1) * _SH_RANGE
     quats = _unpacked_rotations(vertices["packed_rotation"])
     with np.errstate(over="ignore"):  # infinite, and therefore invalid
-        gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
-    return without_invalid(path, gaussians, most_invalid)
+        return Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -167,24 +167,16 @@ def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     if not len(starts):
         return values, values, values
     low, high = (bound.reduceat(values, starts, axis=0) for bound in (np.minimum, np.maximum))
-    first, last = (_by_row(bound, len(values)).astype(np.float64) for bound in (low, high))
+    first, last = (_by_row(bound, len(values)) for bound in (low, high))
     return low, high, (values - first) / np.where(last > first, last - first, 1)
 
 
-def _between(
-    path: str | Path, chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray
-) -> np.ndarray:
-    """Return the values [N, 3] at fractions between the bounds of their chunks, the inverse of
-    `_within_chunks`.
-    """
-    names = [name for ends in _BOUNDS[key] for name in ends]
-    _check_columns(path, "chunk", chunks, names, "<f4")
-    N = len(fractions)
+def _between(chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray) -> np.ndarray:
+    """Return the values [N, 3] at fractions between the bounds of their chunks."""
     low, high = (
-        np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1)
-        for ends in _BOUNDS[key]
+        _by_row(np.stack([chunks[name] for name in names], axis=1), len(fractions))
+        for names in _BOUNDS[key]
     )
-    low, high = (_by_row(bound, N) for bound in (low, high))
     # NaN where a bound is infinite: the Gaussians of the chunk are invalid.
     with np.errstate(invalid="ignore"):
         return low * (1 - fractions) + high * fractions
@@ -192,18 +184,7 @@ def _between(
 
 def _by_row(bounds: np.ndarray, N: int) -> np.ndarray:
     """Return the bounds [N, 3] of each Gaussian's chunk, given the `bounds` [C, 3] of C chunks."""
-    return bounds.repeat(_CHUNK, axis=0)[:N]
-
-
-def _check_columns(
-    path: str | Path, element: str, columns: dict[str, np.ndarray], names: Sequence[str], dtype: str
-) -> None:
-    types = {name: values.dtype.newbyteorder("<") for name, values in columns.items()}
-    if faults := [name for name in names if types.get(name) != dtype]:
-        raise ValueError(
-            f"{path}: expected a compressed PLY, got an element {element} without "
-            f"{', '.join(faults)} as {np.dtype(dtype).name}; export it again."
-        )
+    return bounds.astype(np.float64).repeat(_CHUNK, axis=0)[:N]
 
 
 def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
@@ -212,10 +193,8 @@ def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """
     words = np.zeros(len(fractions), np.uint32)
     for column, count in zip(fractions.T, bits, strict=True):
-        most = 2**count - 1
-        words = words << np.uint32(count) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(
-            np.uint32
-        )
+        steps = np.floor(np.clip(column, 0, 1) * (2**count - 1) + 0.5)
+        words = words << np.uint32(count) | steps.astype(np.uint32)
     return words
 
 

@@ -16,6 +16,7 @@ import OpenEXR
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.files import atomic_path
+from morgs_mi.io.listing import existing_file
 
 _MAGIC = 20000630
 _MULTIPART = 1 << 12
@@ -133,8 +134,7 @@ def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
 
 def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the channels of an EXR file by name, and its header."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"read_exr(): there is no file {path}; check the path.")
+    existing_file(path, "an EXR file")
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.checks import LARGEST
+from morgs_mi.core.checks import LARGEST, few
 from morgs_mi.core.gaussians import Gaussians
 
 _log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     if len(zero):
         _log.warning(
             "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
-            *(path, len(zero), N, _few(zero)),
+            *(path, len(zero), N, few(zero, _MOST_NAMED)),
         )
     every = np.ones(N, bool)
     faults = []
@@ -53,7 +53,8 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         within = (values <= limit) & (values >= -LARGEST)
         rows = np.logical_and.reduce(within, axis=tuple(range(1, values.ndim)))
         if not rows.all():
-            faults.append(f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}")
+            numbers = few(np.flatnonzero(~rows), _MOST_NAMED)
+            faults.append(f"{_WORDS.get(name, name)} of {numbers}")
         every &= rows
     count = int(N - every.sum())
     _warn_far(path, raw["means"][every], raw["log_scales"][every])
@@ -84,9 +85,3 @@ def _warn_far(path: str | Path, means: np.ndarray, log_scales: np.ndarray) -> No
             "tenth of the Gaussians' sizes or more; subtract an origin before they are exported.",
             *(path, *middle),
         )
-
-
-def _few(rows: np.ndarray) -> str:
-    """Return the first indices in words."""
-    more = len(rows) - _MOST_NAMED
-    return ", ".join(map(str, rows[:_MOST_NAMED])) + (f" and {more} more" if more > 0 else "")

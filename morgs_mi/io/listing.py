@@ -24,6 +24,17 @@ def is_added(name: str) -> bool:
     return name.startswith("._") or name.lower() in _ADDED
 
 
+def existing_file(path: str | Path, kind: str, remedy: str = "check the path") -> Path:
+    """Return the path of a file.
+
+    Raises:
+        FileNotFoundError: there is no such file; the sentence names the kind that was expected.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: expected {kind}, found none; {remedy}.")
+    return Path(path)
+
+
 def listed(folder: str | Path) -> list[Path]:
     """Return the files and folders in a folder that are neither hidden nor added by a system, by
     name.

@@ -68,12 +68,17 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     return list(best)
 
 
-def numbering_gap(numbers: Sequence[int]) -> int | None:
-    """Return the index of the first number that does not continue the sequence, or None."""
-    if len(numbers) < 2:
-        return None
+def check_numbering(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> None:
+    """Raise an error unless the numbers of a folder's frames ascend in equal steps.
+
+    Raises:
+        ValueError: they do not; the sentence has the `names` before and behind the gap.
+    """
     steps = np.diff(numbers)
-    least = steps.min()
-    if least >= 1 and least == steps.max():
-        return None
-    return 1 + int(np.argmax(steps != least) if least > 0 else np.argmin(steps))
+    least = min(steps, default=1)
+    if least < 1 or (steps != least).any():
+        gap = int(np.argmax(steps != least) if least > 0 else np.argmin(steps))
+        raise ValueError(
+            f"{folder}: the frames must be numbered without gaps, got {names[gap]} followed by "
+            f"{names[gap + 1]}; extract them again, or go on without the missing ones (--gaps)."
+        )

@@ -23,7 +23,7 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.io.invalid import without_invalid
+from morgs_mi.io.listing import existing_file
 from morgs_mi.io.mitsuba_ply import from_mitsuba, mitsuba_columns
 from morgs_mi.io.ply_kinds import as_3dgs
 
@@ -97,7 +97,7 @@ def write_ply(
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
 
 
-def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
+def read_ply(path: str | Path) -> Gaussians:
     """Return the Gaussians in a PLY file of this package or of another tool: binary or text, SH of
     degree 0 to 3.
 
@@ -106,23 +106,12 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     finite ones, as in `from_activated`. `ply_kinds` lists the kinds of Gaussians of other methods
     that are read. All attributes of the layout ``mitsuba`` of `write_ply` are read.
 
-    Args:
-        path: the file.
-        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0:
-            none.
-
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, is truncated, lacks a property, holds another kind of
-            Gaussians, or has more invalid ones.
+        ValueError: it is not a PLY file, is truncated, lacks a property, or holds another kind of
+            Gaussians.
     """
-    vertices = read_vertices(path)
-    if "packed_position" in vertices:
-        raise ValueError(
-            f"{path}: expected an uncompressed PLY, got PlayCanvas' compressed one; read it with "
-            "`read_splats`."
-        )
-    vertices, more = from_mitsuba(vertices)
+    vertices, more = from_mitsuba(read_vertices(path))
     vertices = as_3dgs(path, vertices)
     expected = (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION)
     if missing := [name for name in expected if name not in vertices]:
@@ -134,14 +123,14 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     K = 1 + count // 3
     if count not in SH_DEGREES or not vertices.keys() >= {*rest_names(K)}:
         raise ValueError(
-            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
-            f"{count} of them; export the Gaussians with SH of degree 3 or less."
+            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 or none, got {count} of them; export "
+            "the Gaussians with SH of degree 3 or less."
         )
     coeffs = np.empty((len(vertices["x"]), K, 3), np.float32)
     coeffs[:, 0] = _table(vertices, _DC)
     rest = _table(vertices, rest_names(K)).reshape(len(coeffs), 3, K - 1)
     coeffs[:, 1:] = rest.transpose(0, 2, 1)
-    gaussians = Gaussians(
+    return Gaussians(
         _table(vertices, _MEAN),
         _table(vertices, _SCALE),
         _table(vertices, _ROTATION),
@@ -149,7 +138,6 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         coeffs,
         **more,
     )
-    return without_invalid(path, gaussians, most_invalid)
 
 
 def _table(vertices: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
@@ -193,15 +181,13 @@ def read_elements(
         ValueError: it is not a PLY file, lacks an element, or has fewer rows than its header
             claims.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a PLY file, found none; check the path.")
     try:
-        with path.open("rb") as file:
+        with existing_file(path, "a PLY file").open("rb") as file:
             order, elements = _read_header(file)
             names = {element.name for element in elements}.intersection((*required, *optional))
-            if missing_names := [name for name in required if name not in names]:
-                raise ValueError(f"it has no element {missing_names[0]}")
+            for name in required:
+                if name not in names:
+                    raise ValueError(f"it has no element {name}")
             return _read_properties(file, order, elements, names)
     except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise ValueError(
@@ -224,21 +210,19 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
     """Return the byte order, empty for text, and the elements."""
     if file.readline(8).strip() != b"ply":
         raise ValueError("it does not begin with `ply`")
-    order = None
+    order = ""
     elements = []
     # Beyond any header: a file without line ends would be read as one line.
     while line := file.readline(4096):
-        words = line.decode("ascii", errors="replace").split()
-        if words == ["end_header"]:
-            if order is None:
-                raise ValueError("its header has no format")
-            return order, elements
-        if words[:1] == ["format"]:
-            order = _BYTE_ORDERS[words[1]]
-        elif words[:1] == ["element"]:
-            elements.append(_Element(words[1], int(words[2]), []))
-        elif words[:1] == ["property"]:
-            elements[-1].properties.append(words)
+        match line.decode("ascii", errors="replace").split():
+            case ["end_header"]:
+                return order, elements
+            case ["format", name, *_]:
+                order = _BYTE_ORDERS[name]
+            case ["element", name, count, *_]:
+                elements.append(_Element(name, int(count), []))
+            case ["property", *words]:
+                elements[-1].properties.append(words)
     raise ValueError("its header does not end")
 
 
@@ -252,20 +236,15 @@ def _read_properties(
     for element in elements:
         if properties.keys() == names:
             break
-        if any(words[1] == "list" for words in element.properties):
-            raise ValueError(
-                f"the element {element.name} has lists before the end of what is read, write it "
-                "without them"
-            )
-        dtype = np.dtype([(words[2], order + _TYPES[words[1]]) for words in element.properties])
+        if any(words[0] == "list" for words in element.properties):
+            raise ValueError(f"its element {element.name} has lists, write it without them")
+        dtype = np.dtype([(words[1], order + _TYPES[words[0]]) for words in element.properties])
         count = element.count
         # A number in a text takes a digit and a separator.
         size = count * dtype.itemsize if order else 2 * count * len(element.properties) - 1
         num_bytes = os.fstat(file.fileno()).st_size - file.tell()
         if count < 0 or size > num_bytes:
-            raise ValueError(
-                f"{count} {element.name} need at least {size} bytes, {num_bytes} follow"
-            )
+            raise ValueError(f"{count} {element.name} need {size} bytes, {num_bytes} follow")
         is_read = element.name in names
         if order and not is_read:
             file.seek(count * dtype.itemsize, 1)

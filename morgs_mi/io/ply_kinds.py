@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+
+from morgs_mi.core.checks import few
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +41,23 @@ _HARMLESS = re.compile(
     r"|\w*_?id|index|segment\w*|cluster\w*|class\w*|instance\w*|semantic\w*|object\w*|category"
     r"|selected|state|error|uncertainty|confidence"
 )
+# Kinds that are not read: what was expected and found, and the remedy.
+_REFUSED = {
+    "timestamps": (
+        "the Gaussians of one timestamp, got several timestamps, as of Spacetime Gaussians or 4D "
+        "Gaussian Splatting",
+        "export a .ply of each timestamp with the program that trained them, which `morgs-mi "
+        "import` turns into a stream",
+    ),
+    "anchors": (
+        "Gaussians, got anchors of Scaffold-GS, of which a network makes the Gaussians of a view",
+        "export Gaussians with the program that trained them",
+    ),
+    "integers": (
+        "Gaussians with floats, got integers, which stand for entries of a codebook",
+        "export the Gaussians uncompressed",
+    ),
+}
 _GAUSSIAN = {"f_dc_0", "opacity", "scale_0", "rot_0"}
 # Folders and what their files have that is not read: a sequence has a file for every frame.
 _named: set[tuple[Path, str]] = set()
@@ -60,28 +78,19 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     # Not all Gaussians of several timestamps in one file are ever in one image.
     times = [n for n, v in vertices.items() if _TIME.fullmatch(n) and (v != v[:1]).any()]
     motions = [n for n, v in vertices.items() if _MOTION.fullmatch(n) and (v != 0).any()]
-    if evidence := [*times, *motions, *filter(_FOURTH.fullmatch, vertices)]:
-        raise ValueError(
-            f"{path}: expected the Gaussians of one timestamp, got several timestamps, as of "
-            f"Spacetime Gaussians or 4D Gaussian Splatting ({_listed(evidence)}); export a .ply "
-            "of each timestamp with the program that trained them, which `morgs-mi import` turns "
-            "into a stream."
-        )
-    if anchors := [*filter(_ANCHOR.fullmatch, vertices)]:
-        raise ValueError(
-            f"{path}: expected Gaussians, got anchors of Scaffold-GS ({_listed(anchors)}), of "
-            "which a network makes the Gaussians of a view; export Gaussians with the program "
-            "that trained them."
-        )
-    if integers := [n for n, v in vertices.items() if _READ.fullmatch(n) and v.dtype.kind != "f"]:
-        raise ValueError(
-            f"{path}: expected Gaussians with floats, got integers in {_listed(integers)}, which "
-            "stand for entries of a codebook; export the Gaussians uncompressed."
-        )
+    evidence = {
+        "timestamps": [*times, *motions, *filter(_FOURTH.fullmatch, vertices)],
+        "anchors": [*filter(_ANCHOR.fullmatch, vertices)],
+        "integers": [n for n, v in vertices.items() if _READ.fullmatch(n) and v.dtype.kind != "f"],
+    }
+    for kind, names in evidence.items():
+        if names:
+            expected, remedy = _REFUSED[kind]
+            raise ValueError(f"{path}: expected {expected} ({few(sorted(names))}); {remedy}.")
     unread = [name for name in vertices if not (_READ.fullmatch(name) or _HARMLESS.fullmatch(name))]
     folder = Path(path).parent
     networks = [network.name for network in folder.glob("deformation*.pth")]
-    names = _listed([*unread, *networks])
+    names = few(sorted([*unread, *networks]))
     if names and (folder, names) not in _named:
         _named.add((folder, names))
         _log.warning("%s: it is drawn without %s, which may change the image.", path, names)
@@ -90,14 +99,8 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
 
 def _with_third_axis(path: str | Path, vertices: Vertices) -> Vertices:
     """Return Gaussians with three axes: discs have none along their normal."""
-    axes = [name for name in ("scale_0", "scale_1", "scale_2") if name in vertices]
-    if len(axes) == 3 or not axes or "opacity" not in vertices:
+    if "scale_2" in vertices or not vertices.keys() >= {"scale_0", "scale_1", "opacity"}:
         return vertices
-    if axes != ["scale_0", "scale_1"]:
-        raise ValueError(
-            f"{path}: expected Gaussians with three axes, or discs of 2D Gaussian Splatting with "
-            f"two, got {_listed(axes)} alone; export Gaussians with scale_0 to scale_2."
-        )
     _log.warning(
         "%s: it has discs of 2D Gaussian Splatting (no scale_2); they are drawn with a third axis "
         "of size 0.",
@@ -130,11 +133,3 @@ def _scaled_logit(logit: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Return the logit of an opacity multiplied by a factor."""
     opacity = factor / (1 + np.exp(-logit))
     return np.log(opacity) - np.log1p(-opacity)
-
-
-def _listed(names: Iterable[str]) -> str:
-    """Return names in order, the first few of many."""
-    ordered_names = sorted(names)
-    return ", ".join(ordered_names[:6]) + (
-        f" and {len(ordered_names) - 6} more" if len(ordered_names) > 6 else ""
-    )

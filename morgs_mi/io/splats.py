@@ -17,6 +17,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.invalid import without_invalid
+from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply import read_ply
 
 SUFFIXES = (".compressed.ply", ".ply", ".splat")
@@ -53,37 +54,35 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         ValueError: the file has another format, is broken or truncated, or has more invalid
             Gaussians.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(
-            f"{path}: expected a file with Gaussians, found none; check the path."
-        )
+    path = existing_file(path, "a file with Gaussians")
     refuse_foreign(path)
     suffix = suffix_of(path)
     if suffix is None:
         raise ValueError(
             f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got "
-            f"{Path(path).suffix!r}; convert it."
+            f"{path.suffix!r}; convert it."
         )
-    if suffix == ".splat":
-        return _read_splat(Path(path), most_invalid)
-    with Path(path).open("rb") as file:
+    with path.open("rb") as file:
         header = file.read(4096).partition(b"end_header")[0]
-    is_compressed = suffix == ".compressed.ply" or b"packed_position" in header
-    return (read_compressed_ply if is_compressed else read_ply)(path, most_invalid)
+    if suffix == ".splat":
+        read = _read_splat
+    elif suffix == ".compressed.ply" or b"packed_position" in header:
+        read = read_compressed_ply
+    else:
+        read = read_ply
+    return without_invalid(path, read(path), most_invalid)
 
 
-def _read_splat(path: Path, most_invalid: float) -> Gaussians:
+def _read_splat(path: Path) -> Gaussians:
     size = path.stat().st_size
     if size % _RECORD.itemsize:
         raise ValueError(
-            f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes, "
-            "which is no multiple; the file is truncated or no .splat, export it again."
+            f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes; "
+            "export it again."
         )
     records = np.fromfile(path, _RECORD)
     scales = np.where(records["scales"] >= 0, records["scales"], np.nan)
     quats = (records["quats"] - 128.0) / 128
     colors = (records["color"] / 255 - 0.5) / SH_C0
-    gaussians = Gaussians.from_activated(
-        records["means"], scales, quats, records["opacity"] / 255, colors[:, None]
-    )
-    return without_invalid(path, gaussians, most_invalid)
+    opacities = records["opacity"] / 255
+    return Gaussians.from_activated(records["means"], scales, quats, opacities, colors[:, None])

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -28,8 +29,8 @@ from morgs_mi.core.bounded import check_claim
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import clock, true_rate
 from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, images_in
-from morgs_mi.io.numbering import counting_together, frame_numbers, numbering_gap
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, existing_file, images_in
+from morgs_mi.io.numbering import check_numbering, counting_together, frame_numbers
 
 if TYPE_CHECKING:
     import av  # imported where a video is opened, as it takes 80 ms
@@ -41,6 +42,8 @@ _BYTES_PER_PIXEL = 6
 # White of images of 16 bits, and the bits of cameras that are stored in them.
 _WHITE = 2**16 - 1
 _BITS = (8, 10, 12, 14)
+# What a file is expected to be, and the remedy if there is none.
+_IMAGE = ("an image", "extract the frames again, or go on without it (--gaps)")
 _LOG = logging.getLogger(__name__)
 # First frame that is worth a search, and the frames before it at which the search aims: those shown
 # right after a keyframe may refer to frames before it, and a file may be indexed by the times of
@@ -58,8 +61,29 @@ def natural_key(name: str) -> list[str | int]:
     return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
 
 
+class _Frames(ABC):
+    """The members that the readers share."""
+
+    num_frames: int
+
+    @abstractmethod
+    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]: ...
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
+        """Yield frames start..stop-1, by default up to `num_frames`.
+
+        Raises:
+            ValueError: a frame cannot be decoded or has another size than the first.
+            FileNotFoundError: an image is missing.
+        """
+        for image in self.pick(range(self.num_frames)[start:stop]):
+            if isinstance(image, Exception):
+                raise image
+            yield image
+
+
 @dataclass(frozen=True)
-class VideoReader:
+class VideoReader(_Frames):
     """Reader of a video file.
 
     Each call of `frames` or `pick` decodes from the start, or far from there from a keyframe.
@@ -121,7 +145,11 @@ class VideoReader:
             if (regular := clock(times)) is not None:
                 positions, rate = regular
                 periods = float(positions[-1] - positions[0])
-                _check_span(path, positions, rate, times)
+                if positions[-1] > 10 * num_held + _MAX_PAUSE:
+                    raise ValueError(
+                        f"{path}: expected {num_held} frames at about {rate:.3g} per second, got "
+                        f"times that span {times[-1]:.3g} s; convert the clip."
+                    )
             fps = true_rate(fps, periods, float(times[-1]))
             # A header may have the length of another stream's last packet.
             if not num_frames and length * fps > periods + 1.5:
@@ -129,16 +157,6 @@ class VideoReader:
         if not num_held <= num_frames <= path.stat().st_size:  # a frame takes more than a byte
             num_frames = num_held
         return cls(path, num_frames, fps or None, width, height, num_held, positions, stamps, times)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
-        """Yield frames start..stop-1, by default up to `num_frames`.
-
-        Raises:
-            ValueError: a frame before `stop` cannot be decoded.
-        """
-        return _raising(
-            self.pick(range(start, self.num_frames if stop is None else min(stop, self.num_frames)))
-        )
 
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
         """Yield the frames of ascending `indices`, with an error in place of each that cannot be
@@ -214,20 +232,15 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoS
     import av
     from av.error import FFmpegError
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
+    existing_file(path, "a video file")
     try:
         container = av.open(f"file:{path}")  # a colon in the path would name a protocol
     except FFmpegError as error:
         raise _unreadable(path, str(error.strerror)) from None
     with container:
         stream = container.streams.best("video")
-        if not isinstance(stream, av.VideoStream):
-            raise _unreadable(path, "it has no images")
-        if stream.codec_context is None:
-            raise _unreadable(path, "FFmpeg has no decoder for its codec")
+        if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
+            raise _unreadable(path, "it has no images, or FFmpeg has no decoder for its codec")
         stream.thread_type = "AUTO"
         yield container, stream
 
@@ -274,7 +287,7 @@ def _unreadable(path: Path, reason: str) -> ValueError:
 
 
 @dataclass(frozen=True)
-class FolderReader:
+class FolderReader(_Frames):
     """Reader of a folder of numbered images, e.g. ``0000.png``, with the members of `VideoReader`,
     `fps` and `positions` being None.
 
@@ -306,12 +319,7 @@ class FolderReader:
         images = _images(path)
         files = list(images.values())
         numbers = list(images)
-        if gap := numbering_gap(numbers):
-            raise ValueError(
-                f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} "
-                f"followed by {files[gap].name}; extract the frames again, or go on without the "
-                "missing ones (--gaps)."
-            )
+        check_numbering(path, numbers, [file.name for file in files])
         step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
         return replace(cls.of_files(files), numbers=range(numbers[0], numbers[-1] + step, step))
 
@@ -322,14 +330,10 @@ class FolderReader:
 
         Raises:
             FileNotFoundError: a file is missing.
-            ValueError: there are none, or the first cannot be decoded.
+            ValueError: the first cannot be decoded.
         """
-        if not files:
-            raise ValueError(
-                "FolderReader.of_files(): expected at least one image, got none; list the frames."
-            )
-        if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
-            raise _no_image(missing)
+        for file in () if gaps else files:
+            existing_file(file, *_IMAGE)
         readable = (f for f in files if not (gaps and isinstance(_image_or_error(f), Exception)))
         first = _read_image(next(readable, files[0]))
         most = int(first.max()) if first.dtype == np.uint16 else None
@@ -346,14 +350,6 @@ class FolderReader:
     def has_light(self) -> bool:
         """Whether the images are EXR files, which have linear light."""
         return self.files[0].suffix.lower() == EXR_SUFFIX
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
-        """Yield frames start..stop-1.
-
-        Raises:
-            ValueError: an image cannot be decoded or has another size than the first.
-        """
-        return _raising(self.pick(range(self.num_frames)[start:stop]))
 
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
         """Yield the frames `indices`, with an error in place of each that is missing, broken or of
@@ -383,15 +379,6 @@ class FolderReader:
                 )
             else:
                 yield cv2.convertScaleAbs(frame, alpha=255 / self.white)
-
-
-def _check_span(path: Path, positions: np.ndarray, rate: float, times: np.ndarray) -> None:
-    """Check that a clip does not pause for more frames than could be listed."""
-    if positions[-1] > 10 * len(times) + _MAX_PAUSE:
-        raise ValueError(
-            f"{path}: expected {len(times)} frames at about {rate:.3g} per second, got time stamps "
-            f"that span {times[-1]:.3g} s; they are broken, convert the clip."
-        )
 
 
 FrameReader = VideoReader | FolderReader
@@ -467,8 +454,8 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
             gap = int(np.argmax(steps))
             file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
             raise ValueError(
-                f"{file}: expected images numbered without large gaps, got this after "
-                f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
+                f"{file}: expected images numbered without large gaps, got this after number "
+                f"{numbers[gap]}; rename or remove it."
             )
         timestamps = range(numbers[0], numbers[-1] + 1, step)
         for folder, files in zip(group, clips, strict=True):
@@ -489,31 +476,14 @@ def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> Fram
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
 
 
-def _raising(images: Iterator[ImageOrError]) -> Iterator[np.ndarray]:
-    for image in images:
-        if isinstance(image, Exception):
-            raise image
-        yield image
-
-
 def _images(path: Path) -> dict[int, Path]:
     """Return a folder's images by their numbers, in natural order."""
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: expected a folder of images, found none; check the path.")
-    files = sorted(images_in(path), key=lambda f: natural_key(f.stem))
+    images = images_in(path) if path.is_dir() else []
+    files = sorted(images, key=lambda f: natural_key(f.stem))
     if not files:
-        raise FileNotFoundError(
-            f"{path}: expected images ({', '.join((*IMAGE_SUFFIXES, EXR_SUFFIX))}), found none; "
-            "extract the frames."
-        )
+        suffixes = ", ".join((*IMAGE_SUFFIXES, EXR_SUFFIX))
+        raise FileNotFoundError(f"{path}: expected images ({suffixes}), found none; extract them.")
     return dict(zip(frame_numbers(path, [file.stem for file in files]), files, strict=True))
-
-
-def _no_image(file: Path) -> FileNotFoundError:
-    return FileNotFoundError(
-        f"{file}: expected an image, found none; extract the frames again, or go on without it "
-        "(--gaps)."
-    )
 
 
 def _image_or_error(file: Path) -> ImageOrError:
@@ -524,8 +494,7 @@ def _image_or_error(file: Path) -> ImageOrError:
 
 
 def _read_image(file: Path) -> np.ndarray:
-    if not file.is_file():
-        raise _no_image(file)
+    existing_file(file, *_IMAGE)
     if file.suffix.lower() == EXR_SUFFIX:
         try:
             return read_light(file)
@@ -535,8 +504,7 @@ def _read_image(file: Path) -> np.ndarray:
     image = decode_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
         raise ValueError(
-            f"{file}: expected an image of 8 or 16 bits, got {image.dtype}; convert it to one, or "
-            "to EXR."
+            f"{file}: expected 8 or 16 bits, got {image.dtype}; convert it to one, or to EXR."
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 

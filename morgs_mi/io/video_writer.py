@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -52,32 +53,20 @@ def write_video(
 def _write_file(
     partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str
 ) -> None:
+    frames = _checked(path, frames)
+    first = next(frames)
+    size = first.shape[1::-1]
+    fourcc = cv2.VideoWriter.fourcc(*codec)
+    encoder = cv2.VideoWriter(f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, size)
     count = 0
-    encoder = None
     try:
-        for frame in _checked(path, frames):
-            if encoder is None:
-                height, width = frame.shape[:2]
-                if width % 2 or height % 2:
-                    raise ValueError(
-                        f"write_video({path}): the width and height must be even, because OpenCV "
-                        f"drops an odd column or row, got {width}x{height}; crop, or write a "
-                        "folder of PNGs."
-                    )
-                fourcc = cv2.VideoWriter.fourcc(*codec)
-                encoder = cv2.VideoWriter(
-                    f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, (width, height)
-                )
-                if not encoder.isOpened():
-                    raise OSError(
-                        f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 "
-                        "or mp4v"
-                    )
+        if not encoder.isOpened():
+            raise OSError(f"OpenCV has no encoder {codec!r} for it; try the codec FFV1 or mp4v")
+        for frame in chain([first], frames):
             encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             count += 1
     finally:
-        if encoder is not None:
-            encoder.release()
+        encoder.release()
     # OpenCV's writer reports no failure, not even a full disk, so the decodable frames are counted.
     stream = cv2.VideoCapture(f"file:{partial}", cv2.CAP_FFMPEG)
     readable = 0
@@ -91,15 +80,14 @@ def _write_file(
 def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     shape = None
     for i, frame in enumerate(frames):
-        shape = frame.shape if shape is None else shape
-        is_image = frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3
-        if not is_image or frame.shape != shape:
+        shape = shape or (*frame.shape[:2], 3)
+        # OpenCV drops an odd column or row of a video.
+        is_odd = path.suffix and (shape[0] % 2 or shape[1] % 2)
+        if frame.dtype != np.uint8 or frame.shape != shape or is_odd:
             raise ValueError(
-                f"write_video({path}): frame {i} must be uint8 [H, W, 3] of the first frame's size "
-                f"{shape[:2]}, got {frame.dtype} {frame.shape}; convert it first."
+                f"write_video({path}): frame {i} must be uint8 {[*shape]} like the first, in a "
+                f"video of even sizes, got {frame.dtype} {[*frame.shape]}; convert it first."
             )
         yield frame
     if shape is None:
-        raise ValueError(
-            f"write_video({path}): at least one frame was expected, got none; pass frames."
-        )
+        raise ValueError(f"write_video({path}): at least one frame was expected, got none.")

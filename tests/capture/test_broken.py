@@ -131,7 +131,7 @@ POSES_BOUNDS = {
     ),
     "gaps and no clip": (
         empty("cam00.mkv"),
-        "cam00.mkv: expected a video, got an empty file",
+        "cam00.mkv: expected a video, got 0 bytes",
         "--gaps",
     ),
     "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .*no frame can be decoded"),
@@ -146,14 +146,13 @@ BY_FRAME = {
     ),
     "no frame": (
         lambda path: (path / "frame000001").rename(path / "frame000007"),
-        "the folders of the frames must be numbered without gaps, got frame000000 followed by "
-        "frame000002",
+        "the frames must be numbered without gaps, got frame000000 followed by frame000002",
     ),
 }
 COLMAP = {
     "pipe": (
         pipe("sparse/0/images.txt"),
-        "images.txt: expected a file, got a folder, a pipe or a device; remove it",
+        "images.txt: expected a file of a COLMAP model, found none",
     ),
     "other clips": (
         renamed,
@@ -179,6 +178,10 @@ COLMAP = {
         replace("sparse/0/points3D.txt", " 51 ", " 300 "),
         r"`point_colors` must be in \[0, 1\], got .*; divide",
     ),
+    "infinite point": (
+        replace("sparse/0/points3D.txt", "1 0.1 ", "1 inf "),
+        "`points` must be finite and at most .*, got .inf",
+    ),
     "long rate": (
         lambda path: (path / "capture.json").write_text('{"fps": 1' + 400 * "0" + "}"),
         "capture.json: `fps` must be a number in .1e-6, 1e6., got 1000",
@@ -192,7 +195,7 @@ NERFSTUDIO = {
     ),
     "no frames": (
         transforms(lambda m: m.update(frames=[])),
-        "expected an object with a list of `frames`, got none",
+        "transforms.json: `frames` must be a list of objects, got \\[\\]",
     ),
     "broken file": (
         truncated("transforms.json"),
@@ -213,7 +216,7 @@ NERFSTUDIO = {
     "word": (transforms(lambda m: m.update(k1="no")), "`k1` must be a finite number .* got 'no'"),
     "unknown model": (
         transforms(lambda m: m.update(camera_model="EQUIRECTANGULAR")),
-        "got 'EQUIRECTANGULAR'; undist",
+        "got 'EQUIRECTANGULAR' with 0; undist",
     ),
     "long number": (
         transforms(lambda m: m.update(k1=10**400)),
@@ -225,16 +228,19 @@ NERFSTUDIO = {
     ),
     "k4": (
         transforms(lambda m: m.update(k4=0.1)),
-        "`k4` must be 0 in a perspective camera, got 0.1",
+        "with a `k4` of 0 one of .*, got 'OPENCV' with 0.1; undist",
     ),
-    "NaN pose": (transforms(pose(1, NAN)), "frame 1 .*cam2.png.: the pose must be finite"),
+    "NaN pose": (
+        transforms(pose(1, NAN)),
+        "frame 1 .*cam2.png.: `transform_matrix`: the pose must be finite",
+    ),
     "no rotation": (
         transforms(pose(0, 1.5)),
-        "frame 0 .*cam1.png.: the axes must be a right-handed orthonormal frame",
+        "frame 0 .*cam1.png.: .*: the axes must be a right-handed",
     ),
     "long pose": (
         transforms(lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400)),
-        "the pose must be a matrix",
+        "frame 0 .*cam1.png.: int too large",
     ),
     "no pose": (
         transforms(lambda m: m["frames"][0].pop("transform_matrix")),

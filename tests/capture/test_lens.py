@@ -125,7 +125,7 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, radius: 
     ("model", "params", "message"),
     [
         ("FOV", (1, 2, 3), "must be one of SIMPLE_PINHOLE.*got FOV.*image_undistorter"),
-        ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters, got 4"),
+        ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters .*, got 4"),
     ],
 )
 def test_lens_and_intrinsics__refuse_bad_input(

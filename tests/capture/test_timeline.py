@@ -286,7 +286,7 @@ def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> N
     path = timed(tmp_path / "c", a=REGULAR[:5], b=LATE)
     with pytest.raises(
         ValueError,
-        match=r"b.mp4: expected a constant frame rate, .* frame 3 is 100 ms late; .*--trim",
+        match=r"b.mp4: expected a constant frame rate, got frame 3 100 ms late; .*--trim",
     ):
         load_capture(path)
     assert load_capture(path, max_frames=3).num_frames == 3

@@ -50,7 +50,7 @@ def test_write_exr__raises_and_leaves_nothing_on_failure(tmp_path):
 
 
 def test_read_exr__distinguishes_missing_and_damaged_files(tmp_path):
-    with pytest.raises(FileNotFoundError, match="there is no file"):
+    with pytest.raises(FileNotFoundError, match="expected an EXR file, found none"):
         read_exr(tmp_path / "a.exr")
     write_exr(tmp_path / "a.exr", {"a": np.random.default_rng(0).normal(size=(64, 64))})
     whole = (tmp_path / "a.exr").read_bytes()

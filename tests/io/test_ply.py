@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 from morgs_mi import ellipsoids
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import read_ply, write_ply
+from morgs_mi.io.splats import read_splats
 from tests.assertions import assert_close
 from tests.scenes.gaussians import RAW, make_unit_scene, to_gaussians
 
@@ -94,7 +95,7 @@ def test_read_ply__names_an_invalid_motion(tmp_path):
     raw["motion"][3, 1] = np.nan
     write_ply(tmp_path / "g.ply", to_gaussians(raw), layout="mitsuba")
     with pytest.raises(ValueError, match=r"others in 1 of 10 Gaussians \(motion of 3\)"):
-        read_ply(tmp_path / "g.ply")
+        read_splats(tmp_path / "g.ply")
 
 
 def test_write_ply__refuses_an_unknown_layout(tmp_path):
@@ -186,17 +187,13 @@ def with_nan(records):
             r"expected finite numbers of at most 1e\+12, others in 1 of 20 Gaussians \(size of "
             r"3\); leave them out",
         ),
-        (
-            lambda _: np.zeros(4, [("packed_position", "u4")]),
-            "PlayCanvas' compressed one; read it with `read_splats`",
-        ),
     ],
 )
 def test_read_ply__refuses_files_that_it_cannot_read(tmp_path, change, message):
     vertices = change(table(random_gaussians()))
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "g.ply"))
     with pytest.raises(ValueError, match=message):
-        read_ply(tmp_path / "g.ply")
+        read_splats(tmp_path / "g.ply")
 
 
 @pytest.mark.parametrize("size", [0, 3, 60, -5])

@@ -25,14 +25,13 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import few
 from morgs_mi.core.rig import far_origin, moved, scene_extent
 from morgs_mi.io.listing import VIDEO_SUFFIXES, images_in, listed
 from morgs_mi.io.video import Clip, natural_key
 
 _LOG = logging.getLogger(__name__)
 
-# Names in a message: a model may have hundreds of images.
-_MAX_LISTED = 10
 NO_POINTS = np.zeros((0, 3), np.float32)
 """The points, and their colours, of a layout without points."""
 
@@ -173,23 +172,15 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
     )
 
 
-@dataclass(frozen=True)
-class Match:
-    """Fixed cameras and their clips."""
-
-    calibration: Calibration  #: One camera, lens and clip per fixed camera.
-    #: Per camera the indices of its images in the file of the calibration.
-    images: tuple[tuple[int, ...], ...]
-
-
 def match_clips(
     path: Path,
     source: Path,
     clips: Mapping[str, Clip],
     cameras: Sequence[Camera],
     lenses: Sequence[Lens],
-) -> Match:
-    """Return the fixed cameras that have a clip, in numerical order of the clips' names.
+) -> tuple[Calibration, tuple[tuple[int, ...], ...]]:
+    """Return the fixed cameras that have a clip, in numerical order of the clips' names, and the
+    indices of each one's images among `cameras`.
 
     Cameras without a clip, and clips without a camera, are left out with a warning.
 
@@ -211,10 +202,7 @@ def match_clips(
     match = _best_match(path, source, clips, local, lenses)
     clips = match.clips
     if match.without:
-        names = ", ".join(match.without[:_MAX_LISTED])
-        count = len(match.without) - _MAX_LISTED
-        rest = f" and {count} others" if count > 0 else ""
-        _LOG.warning("%s: no clip is named after %s%s: left out.", source, names, rest)
+        _LOG.warning("%s: no clip is named after %s: left out.", source, few(match.without))
     if extras := [name for name in clips if name not in match.images]:
         _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(extras))
     names = sorted(match.images, key=natural_key)
@@ -232,7 +220,7 @@ def match_clips(
     )
     if (path / "masks").is_dir() and not any(calibration.masks):
         _LOG.warning("%s: no mask is named after an image, such as %s.png.png.", path, names[0])
-    return Match(calibration, images)
+    return calibration, images
 
 
 def _masks(path: Path, camera: str, clip: Clip, images: Sequence[str]) -> tuple[Path, ...]:
@@ -296,14 +284,13 @@ def _best_match(
             break
     best = max(matches, key=lambda match: len(match.images), default=None)
     if best is None or not best.images:
-        expected = ", ".join(camera.name for camera in cameras[:_MAX_LISTED])
-        errors.append(
-            FileNotFoundError(
-                f"{source}: expected clips named after its cameras {expected}, found "
-                f"{', '.join(clips)}; name the clips after the cameras."
-            )
+        if errors:
+            raise errors[0]
+        raise FileNotFoundError(
+            f"{source}: expected clips named after its cameras "
+            f"{few([camera.name for camera in cameras])}, found {', '.join(clips)}; name the clips "
+            "after the cameras."
         )
-        raise errors[0]
     if any(isinstance(clip, tuple) and len(clip) > 1 for clip in best.clips.values()):
         check_frames(path, cast(Mapping[str, tuple[Path, ...]], best.clips))
     return best

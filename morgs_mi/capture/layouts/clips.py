@@ -29,7 +29,7 @@ import numpy as np
 
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, images_in, listed
-from morgs_mi.io.numbering import frame_numbers, numbering_gap
+from morgs_mi.io.numbering import check_numbering, frame_numbers
 from morgs_mi.io.video import Clip, natural_key, open_frames
 
 _LOG = logging.getLogger(__name__)
@@ -146,11 +146,7 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
         ValueError: a number is missing or occurs twice.
     """
     folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
-    if gap := numbering_gap(frame_numbers(path, folders)):
-        raise ValueError(
-            f"{path}: the folders of the frames must be numbered without gaps, got "
-            f"{folders[gap - 1]} followed by {folders[gap]}; extract the frames again."
-        )
+    check_numbering(path, frame_numbers(path, folders), folders)
 
 
 def names_without(path: Path, names: Collection[str], without: Collection[str]) -> list[str]:

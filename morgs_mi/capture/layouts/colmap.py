@@ -39,9 +39,9 @@ from morgs_mi.capture.layouts.nerfstudio import read_points_ply
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.core.checks import errors_at
 from morgs_mi.core.files import write_error
-from morgs_mi.io.listing import listed
+from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.video import natural_key
 
 _LOG = logging.getLogger(__name__)
@@ -105,22 +105,14 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     Raises:
         FileNotFoundError: the cameras or the images are missing.
         ValueError: a file is broken, refers to a missing camera, or holds an invalid pose or an
-            unsupported lens.
+            unsupported lens. Points are not checked.
     """
     folder = Path(folder)
     kind = "bin" if (folder / "cameras.bin").exists() else "txt"
     cameras_path, images_path = (folder / f"{name}.{kind}" for name in _FILES)
     for path in (cameras_path, images_path):
-        if not path.exists():
-            raise FileNotFoundError(
-                f"{folder}: a COLMAP model needs cameras and images (.txt or .bin), {path.name} is "
-                "missing; export the whole model."
-            )
-    views = _views(images_path, cameras_path, _intrinsics(cameras_path))
-    if not views:
-        raise ValueError(
-            f"{images_path}: expected at least one image, got none; register the images."
-        )
+        existing_file(path, "a file of a COLMAP model", "export the whole model")
+    views = _views(images_path, _intrinsics(cameras_path))
     cameras, lenses = zip(*views, strict=True)
     paths = (folder / f"points3D.{suffix}" for suffix in (kind, "bin", "txt", "ply"))
     points_path = next((path for path in paths if path.exists()), None)
@@ -133,32 +125,29 @@ def _intrinsics(path: Path) -> dict[int, tuple[Lens, np.ndarray, int, int]]:
     intrinsics = {}
     rows = (binary_cameras if path.suffix == ".bin" else text_cameras)(path)
     for camera_id, model, width, height, params in rows:
-        try:
-            lens, K = lens_and_intrinsics(model, params)
-        except ValueError as error:
-            raise ValueError(f"{path}: camera {camera_id}: {error}") from None
-        intrinsics[camera_id] = (lens, K, width, height)
+        with errors_at(f"{path}: camera {camera_id}"):
+            intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
         check_claim(path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
     return intrinsics
 
 
 def _views(
-    path: Path, cameras_path: Path, intrinsics: Mapping[int, tuple[Lens, np.ndarray, int, int]]
+    path: Path, intrinsics: Mapping[int, tuple[Lens, np.ndarray, int, int]]
 ) -> list[tuple[Camera, Lens]]:
     """Return the camera and the lens of each image of a model."""
     views: list[tuple[Camera, Lens]] = []
     for name, camera_id, pose in (binary_images if path.suffix == ".bin" else text_images)(path):
-        if camera_id not in intrinsics:
-            raise ValueError(
-                f"{path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} "
-                f"has {sorted(intrinsics)}; export both files from the same model."
-            )
-        lens, K, width, height = intrinsics[camera_id]
-        try:
+        with errors_at(f"{path}, image {name!r}"):
+            if camera_id not in intrinsics:
+                raise ValueError(
+                    f"it refers to camera {camera_id}, of {sorted(intrinsics)}; export the whole "
+                    "model."
+                )
+            lens, K, width, height = intrinsics[camera_id]
             views.append((Camera(K, _viewmat(pose), width, height, name), lens))
-        except ValueError as error:
-            raise ValueError(f"{path}, image {name!r}: {error}") from None
         check_claim(path, _CAMERA_BYTES * len(views), f"{len(views)} images")
+    if not views:
+        raise ValueError(f"{path}: expected at least one image, got none; register the images.")
     return views
 
 
@@ -167,13 +156,8 @@ def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if path.suffix == ".ply":
         return read_points_ply(path)
     rows = (binary_points if path.suffix == ".bin" else text_points)(path)
-    points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
-    if not bounded(points):
-        raise ValueError(
-            f"{path}: the points must be finite and at most {LARGEST:g}, got others; "
-            "export the model again."
-        )
-    return points[:, :3], (points[:, 3:] / 255).astype(np.float32)
+    xyz, rgb = np.hsplit(np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64), 2)
+    return xyz, (rgb / 255).astype(np.float32)
 
 
 def write_colmap(
@@ -238,14 +222,11 @@ def _line(*fields: object) -> str:
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
-    if not np.isfinite(pose).all():
-        raise ValueError(f"the pose must be finite, got {[*pose]}; export the model again.")
     quat = np.array(pose[:4])
     # COLMAP writes quaternions of length 1.
     if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
         raise ValueError(
-            f"its quaternion must have length 1, got {quat.tolist()}; check the order of the "
-            "columns."
+            f"its quaternion must have length 1, got {[*pose]}; check the order of the columns."
         )
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
@@ -263,8 +244,8 @@ def _read_calibration(path: Path) -> Calibration:
             *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
         )
     model = read_colmap(folder)
-    match = match_clips(path, folder, clips, model.cameras, model.lenses)
-    return replace(match.calibration, points=model.points, point_colors=model.point_colors)
+    calibration, _ = match_clips(path, folder, clips, model.cameras, model.lenses)
+    return replace(calibration, points=model.points, point_colors=model.point_colors)
 
 
 READER = Reader(

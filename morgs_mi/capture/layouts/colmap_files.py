@@ -1,5 +1,20 @@
 """The files of a COLMAP model, as text and binary.
 
+A text file has a record in each line, apart from comments (#). A binary file has the number of its
+records as uint64, and then the records, little-endian:
+
+    cameras.txt     CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]
+    cameras.bin     uint32 id, int32 model, uint64 width, uint64 height, float64 parameters
+
+    images.txt      IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME
+                    POINTS2D[] as (X, Y, POINT3D_ID), or a blank line
+    images.bin      uint32 id, float64 pose [7], uint32 camera, name and a byte 0,
+                    uint64 number of points, 24 bytes each
+
+    points3D.txt    POINT3D_ID X Y Z R G B ERROR TRACK[]
+    points3D.bin    uint64 id, float64 x y z, uint8 r g b, float64 error,
+                    uint64 length of the track, 8 bytes each
+
 Readers yield a tuple per record: id, model, width, height and parameters of a camera; name, id of
 the camera and pose [7] of an image, a wxyz quaternion and a translation; x, y, z and the colour, 0
 to 255, of a point.
@@ -10,7 +25,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +33,17 @@ import numpy as np
 from morgs_mi.capture.lens import MODELS
 from morgs_mi.core.bounded import read_bytes, regular
 
+# The records, as in the module's docstring: lines of text, and the formats of `struct`.
+_CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
+_CAMERA_BYTES = "<IiQQ"
+_IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+_IMAGE_BYTES = "<I7dI"
+_IMAGE_POINTS = "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line"
+_POINT = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
+_POINT_BYTES = "<Q3d3BdQ"
+_COUNT = "<Q"
 # The least bytes of an image in a binary model.
-_IMAGE_BYTES = 73
-# What precedes the name of an image in a line of text: nine words, and one space. The name may
-# begin with spaces.
-_BEFORE_NAME = re.compile(r"\s*(?:\S+\s+){8}\S+\s")
+_LEAST_IMAGE = 73
 # More values than a line of any camera model has in a text file.
 _MAX_CAMERA_FIELDS = 20
 
@@ -32,8 +53,7 @@ def count_images(folder: Path) -> int:
     with suppress(OSError, ValueError):
         if (folder / "cameras.bin").exists():
             file = _Bytes(folder / "images.bin")
-            (count,) = file.take("Q")
-            return min(count, len(file.data) // _IMAGE_BYTES)
+            return min(*file.take(_COUNT), len(file.data) // _LEAST_IMAGE)
         return sum(1 for _ in text_images(folder / "images.txt"))
     return 0
 
@@ -42,29 +62,31 @@ def count_images(folder: Path) -> int:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the number, from 1, and the text of all lines that are not comments, including blank
-    ones.
-    """
+    """Yield the number, from 1, and the text of all lines but comments, blank lines included."""
     with regular(path).open(encoding="utf-8-sig", errors="replace") as file:
         for i, line in enumerate(file, start=1):
             if not line.startswith("#"):
                 yield i, line.rstrip("\n")
 
 
-def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
-    return ValueError(
-        f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again."
-    )
+@contextmanager
+def _expected(record: str, path: Path, number: int, line: str) -> Iterator[None]:
+    """Name the line and the record that it should hold in an error of reading it."""
+    try:
+        yield
+    except (ValueError, IndexError):
+        raise ValueError(
+            f"{path}, line {number}: expected `{record}`, got {line[:80]!r}; export the model "
+            "again."
+        ) from None
 
 
 def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
     for number, line in _lines(path):
         if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
-            try:
+            with _expected(_CAMERA, path, number, line):
                 camera_id, width, height = (int(fields[k]) for k in (0, 2, 3))
                 params = [float(f) for f in fields[4:]]
-            except (ValueError, IndexError):
-                raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
             yield camera_id, fields[1], width, height, params
 
 
@@ -73,31 +95,27 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
     for number, line in lines:
         if not line.strip():
             continue
-        try:
-            fields = line.split(maxsplit=9)
-            camera_id = int(fields[8])
+        with _expected(_IMAGE, path, number, line):
+            fields = line.rstrip().split(maxsplit=8)
             pose = [float(f) for f in fields[1:8]]
-            name = _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else ""
-        except (ValueError, IndexError):
-            raise _broken(
-                path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line
-            ) from None
+            # The name may begin with spaces.
+            camera_id, name = re.split(r"\s", fields[8], maxsplit=1)
+            camera_id = int(camera_id)
         number, line = next(lines, (number, ""))
         # line.split() would take many times the memory of a line of thousands of points.
         visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
-        if np.count_nonzero(visible[1:] & ~visible[:-1]) % 3:
-            raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
+        with _expected(_IMAGE_POINTS, path, number, line):
+            if np.count_nonzero(visible[1:] & ~visible[:-1]) % 3:
+                raise ValueError
         yield name, camera_id, pose
 
 
 def text_points(path: Path) -> Iterator[list[float]]:
     for number, line in _lines(path):
         if fields := line.split(maxsplit=8):
-            try:
+            with _expected(_POINT, path, number, line):
                 xyz_rgb = [float(f) for f in fields[1:7]]
                 float(fields[7])  # the error, which must be a number
-            except (ValueError, IndexError):
-                raise _broken(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]", line) from None
             yield xyz_rgb
 
 
@@ -112,11 +130,22 @@ class _Bytes:
         self.data = read_bytes(path)
         self.at = 0
 
-    def take(self, layout: str) -> tuple:
-        """Return the fields of one little-endian record."""
-        layout = "<" + layout
-        self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self.data, self.at - struct.calcsize(layout))
+    def records(self, what: str) -> Iterator[None]:
+        """Yield once for each record that the file announces, and check that nothing follows."""
+        (count,) = self.take(_COUNT)
+        for _ in range(count):
+            yield
+        if rest := len(self.data) - self.at:
+            raise ValueError(
+                f"{self.path}: expected the {count} {what} that it announces, got {rest} more "
+                "bytes: the number or the file is broken; export the model again."
+            )
+
+    def take(self, record: str) -> tuple:
+        """Return the fields of a record, by its format."""
+        start = self.at
+        self.skip(struct.calcsize(record))
+        return struct.unpack_from(record, self.data, start)
 
     def skip(self, count: int) -> None:
         if count > (rest := len(self.data) - self.at):
@@ -126,53 +155,37 @@ class _Bytes:
             )
         self.at += count
 
-    def end(self, count: int, what: str) -> None:
-        """Check that nothing follows the `count` records that the file announces."""
-        if rest := len(self.data) - self.at:
-            raise ValueError(
-                f"{self.path}: expected the {count} {what} that it announces, got {rest} more "
-                "bytes: the number or the file is broken; export the model again."
-            )
-
     def string(self) -> str:
         start = self.at
-        end = self.data.find(b"\0", self.at)
+        end = self.data.find(b"\0", start)
         self.skip((end if end >= 0 else len(self.data)) + 1 - start)
         return self.data[start:end].decode("utf-8", errors="replace")
 
 
 def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
     file = _Bytes(path)
-    names = list(MODELS)
-    (count,) = file.take("Q")
-    for _ in range(count):
-        camera_id, model, width, height = file.take("IiQQ")
-        if not 0 <= model < len(names):
-            # lens_and_intrinsics rejects this name; the rest of the file cannot be read.
-            yield camera_id, f"number {model}", width, height, ()
-            return
-        params = file.take(f"{2 + sum(MODELS[names[model]])}d")
-        yield camera_id, names[model], width, height, params
-    file.end(count, "cameras")
+    names = dict(enumerate(MODELS))
+    for _ in file.records("cameras"):
+        camera_id, model, width, height = file.take(_CAMERA_BYTES)
+        # The caller refuses another model by its name.
+        name = names.get(model, f"number {model}")
+        params = file.take(f"<{2 + sum(MODELS.get(name, ()))}d")
+        yield camera_id, name, width, height, params
 
 
 def binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
     file = _Bytes(path)
-    (count,) = file.take("Q")
-    for _ in range(count):
-        _, *pose, camera_id = file.take("I7dI")
+    for _ in file.records("images"):
+        _, *pose, camera_id = file.take(_IMAGE_BYTES)
         name = file.string()
-        (points,) = file.take("Q")
+        (points,) = file.take(_COUNT)
         file.skip(24 * points)
         yield name, camera_id, tuple(pose)
-    file.end(count, "images")
 
 
 def binary_points(path: Path) -> Iterator[list[float]]:
     file = _Bytes(path)
-    (count,) = file.take("Q")
-    for _ in range(count):
-        _, *xyz_rgb, _, track = file.take("Q3d3BdQ")
+    for _ in file.records("points"):
+        _, *xyz_rgb, _, track = file.take(_POINT_BYTES)
         file.skip(8 * track)
         yield xyz_rgb
-    file.end(count, "points")

@@ -11,7 +11,7 @@ the images.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -30,8 +30,8 @@ from morgs_mi.capture.layouts.clips import ImageSizes
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import LARGEST, bounded
-from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from morgs_mi.core.checks import LARGEST, errors_at
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, existing_file
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import Clip
@@ -92,6 +92,23 @@ _HARMLESS = {
     "date",
 }
 
+# Kinds of values: their test, and in words.
+_Kind = tuple[Callable[[Any], bool], str]
+_NUMBER: _Kind = (
+    lambda value: type(value) in (int, float) and abs(value) <= LARGEST,
+    f"be a finite number of at most {LARGEST:g}, here or at the top of the file",
+)
+_FILE: _Kind = (lambda value: value is None or isinstance(value, str), "name a file")
+_NAMES: _Kind = (lambda value: value is None or _is_list(value, str), "be a list of names")
+_KINDS: dict[str, _Kind] = {
+    "frames": (lambda value: value != [] and _is_list(value, dict), "be a list of objects"),
+    "file_path": (lambda value: value != "" and isinstance(value, str), "name a file"),
+    "is_fisheye": (lambda value: value in (True, False), "be true or false"),
+    "mask_path": _FILE,
+    "ply_file_path": _FILE,
+    **dict.fromkeys(_SPLITS, _NAMES),
+}
+
 
 @dataclass(frozen=True)
 class Transforms:
@@ -118,84 +135,69 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
             the camera model is not supported.
     """
     meta = read_json(path)
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not frames or not _is_list(frames, dict):
-        raise ValueError(
-            f"{path}: expected an object with a list of `frames`, got none; export it again."
-        )
+    meta = meta if isinstance(meta, dict) else {}
+    with errors_at(str(path)):
+        frames = _value(meta, "frames")
+        points = _value(meta, "ply_file_path")
+        splits = {split: _value(meta, split) for split in _SPLITS}
     sizes = ImageSizes(path.parent, clips or {})
     cameras = []
     lenses = []
     masks = []
+    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     for index, frame in enumerate(frames):
-        name = frame.get("file_path")
-        if not isinstance(name, str) or not name:
-            raise ValueError(
-                f"{path}, frame {index}: `file_path` must name a file, got {name!r}; export it "
-                "again."
-            )
-        where = f"{path}, frame {index} ({name})"
         values = meta | frame
+        with errors_at(f"{path}, frame {index}"):
+            name = _value(values, "file_path")
         if not {"w", "h"} <= values.keys():
             # Of another image if it is missing: its camera is left out later.
             names = [name, *(str(other.get("file_path")) for other in frames)]
             size = next(filter(None, map(sizes.of, names)), ())
             values |= zip(("w", "h"), size, strict=False)
-        cameras.append(_camera(where, values, name))
-        lenses.append(_lens(where, values))
-        masks.append(_file(path, where, values, "mask_path"))
-    points = _file(path, str(path), meta, "ply_file_path")
-    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
-    for frame, lens in zip(frames, lenses, strict=True):
-        if lens.model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
-            values = meta | frame
+        with errors_at(f"{path}, frame {index} ({name})"):
+            cameras.append(_camera(values, name))
+            lenses.append(_lens(values))
+            masks.append(_beside(path, _value(values, "mask_path")))
+        if lenses[-1].model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
             unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
     warn_unread(path, unread)
-    splits = {split: meta[split] for split in _SPLITS if meta.get(split) is not None}
-    for split, names in splits.items():
-        if not _is_list(names, str):
-            raise ValueError(
-                f"{path}: `{split}` must be a list of names of images, got another value; correct "
-                "it."
-            )
-    return Transforms(cameras, lenses, masks, points, splits)
+    splits = {split: names for split, names in splits.items() if names is not None}
+    return Transforms(cameras, lenses, masks, _beside(path, points), splits)
+
+
+def _beside(path: Path, name: str | None) -> Path | None:
+    """Return the file that the file `path` names, or None."""
+    return path.parent / name.replace("\\", "/") if name else None
 
 
 def _is_list(value: Any, kind: type) -> bool:
     return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
 
 
-def _file(path: Path, where: str, values: Mapping[str, Any], key: str) -> Path | None:
-    """Return the file that a value names, relative to the file `path`, or None."""
-    name = values.get(key)
-    if name is not None and not isinstance(name, str):
-        raise ValueError(
-            f"{where}: `{key}` must name a file, got {repr(name)[:80]}; export it again."
-        )
-    return path.parent / name.replace("\\", "/") if name else None
+def _value(values: Mapping[str, Any], key: str, default: Any = None) -> Any:
+    """Return a value of the file, of the kind that its key has."""
+    value = values.get(key, default)
+    is_kind, kind = _KINDS.get(key, _NUMBER)
+    if not is_kind(value):
+        raise ValueError(f"`{key}` must {kind}, got {repr(value)[:80]}; export it again.")
+    return value
 
 
-def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
-    width = _number(where, values, "w")
-    height = _number(where, values, "h")
-    fx = _focal_length(where, values, "x", width)
-    fy = _focal_length(where, values, "y", height, fx)
-    cx = _number(where, values, "cx", width / 2)
-    cy = _number(where, values, "cy", height / 2)
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    try:
-        matrix = np.array(values.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    viewmat = np.linalg.inv(rigid(where, matrix) @ _OPENGL_FROM_OPENCV)
-    try:
-        return Camera(K, viewmat, round(width), round(height), name)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+def _camera(values: Mapping[str, Any], name: str) -> Camera:
+    width = _value(values, "w")
+    height = _value(values, "h")
+    fx = _focal_length(values, "x", width)
+    fy = _focal_length(values, "y", height, fx)
+    cx = _value(values, "cx", width / 2)
+    cy = _value(values, "cy", height / 2)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+    pose = rigid("`transform_matrix`", np.array(values.get("transform_matrix"), np.float64))
+    viewmat = np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
+    return Camera(K, viewmat, round(width), round(height), name)
 
 
 def _focal_length(
-    where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None
+    values: Mapping[str, Any], axis: str, size: float, default: float | None = None
 ) -> float:
     """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image
     has `size` px.
@@ -203,44 +205,23 @@ def _focal_length(
     key = f"fl_{axis}"
     angle = f"camera_angle_{axis}"
     if key not in values and angle in values:
-        return float(0.5 * size / np.tan(0.5 * _number(where, values, angle)))
-    return _number(where, values, key, default)
+        return float(0.5 * size / np.tan(0.5 * _value(values, angle)))
+    return _value(values, key, default)
 
 
-def _lens(where: str, values: Mapping[str, Any]) -> Lens:
+def _lens(values: Mapping[str, Any]) -> Lens:
     model = values.get("camera_model", "OPENCV")
-    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
-    fisheye = values.get("is_fisheye", False)
-    if fisheye not in (True, False):
-        raise ValueError(
-            f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it."
-        )
-    if fisheye or model == "OPENCV_FISHEYE":
+    k1, k2, k3, k4, p1, p2 = (_value(values, key, 0.0) for key in _DISTORTION)
+    if _value(values, "is_fisheye", False) or model == "OPENCV_FISHEYE":
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
-    if model not in _PERSPECTIVE:
+    # Nerfstudio's k4 is the coefficient of r^8, for which COLMAP has no model. OpenCV's k4 is in
+    # the denominator.
+    if model not in _PERSPECTIVE or k4:
         raise ValueError(
-            f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, "
-            f"got {model!r}; undistort the images first."
-        )
-    if k4:
-        # Nerfstudio's k4 is the coefficient of r^8, for which COLMAP has no model. OpenCV's k4 is
-        # in the denominator.
-        raise ValueError(
-            f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images "
-            "first."
+            f"`camera_model` must be OPENCV_FISHEYE, or with a `k4` of 0 one of "
+            f"{', '.join(_PERSPECTIVE)}, got {model!r} with {k4:g}; undistort the images first."
         )
     return opencv_lens((k1, k2, p1, p2, k3))
-
-
-def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
-    value = values.get(key, default)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= LARGEST:
-        got = "none" if value is None else repr(value)[:80]
-        raise ValueError(
-            f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top "
-            f"of the file, got {got}."
-        )
-    return float(value)
 
 
 def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -249,24 +230,15 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file with vertices x, y, z, or they are not finite.
+        ValueError: it is not a PLY file with vertices x, y, z.
     """
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`."
-        )
+    existing_file(path, "the points' PLY file", "copy it or drop `ply_file_path`")
     vertices = read_vertices(path)
     if missing := set("xyz") - vertices.keys():
         raise ValueError(
-            f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
-            f"{', '.join(sorted(missing))}; export it again."
+            f"{path}: expected vertices x, y, z, got no {', '.join(missing)}; export it again."
         )
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    if not bounded(points):
-        raise ValueError(
-            f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
-            "again."
-        )
     if not {"red", "green", "blue"} <= vertices.keys():
         return points, np.full(points.shape, 0.5, np.float32)
     colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
@@ -279,16 +251,14 @@ def _read_calibration(path: Path) -> Calibration:
     source = path / "transforms.json"
     content = read_transforms(source, clips)
     points, colors = read_points_ply(content.points) if content.points else (NO_POINTS, NO_POINTS)
-    match = match_clips(path, source, clips, content.cameras, content.lenses)
+    calibration, images = match_clips(path, source, clips, content.cameras, content.lenses)
     masks = tuple(
-        tuple(dict.fromkeys(file for index in images if (file := content.masks[index])))
-        for images in match.images
+        tuple(dict.fromkeys(file for index in indices if (file := content.masks[index])))
+        for indices in images
     )
-    masks = masks if any(masks) else match.calibration.masks
-    calibration = replace(match.calibration, points=points, point_colors=colors, masks=masks)
-    return (
-        _split(path, source, calibration, content, match.images) if content.splits else calibration
-    )
+    masks = masks if any(masks) else calibration.masks
+    calibration = replace(calibration, points=points, point_colors=colors, masks=masks)
+    return _split(path, source, calibration, content, images) if content.splits else calibration
 
 
 def _split(

@@ -19,6 +19,7 @@ from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_array
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.checks import errors_at
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import Clip
 
@@ -37,49 +38,27 @@ def read_poses_bounds(
         ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is not a valid
             pose.
     """
-    path = Path(path)
-    rows = _rows(path)
-    if len(rows) != len(names):
-        raise ValueError(
-            f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
-            f"({', '.join(names)}); remove the rows of missing videos."
-        )
-    cameras = tuple(
-        _camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True))
-    )
-    return cameras, rows[:, 15:].astype(np.float64)
-
-
-def count_rows(path: Path) -> int:
-    """Return the number of cameras in the file; raises the same errors as `read_poses_bounds`."""
-    return len(_rows(path))
-
-
-def _rows(path: Path) -> np.ndarray:
     rows = read_array(path)
     if rows.shape[1:] != (17,) or rows.dtype.kind != "f":
         raise ValueError(
             f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it "
             "again."
         )
-    return rows
-
-
-def _camera(path: Path, index: int, row: np.ndarray, name: str) -> Camera:
-    where = f"{path}, row {index} ({name})"
-    if not np.isfinite(row).all():
-        raise ValueError(f"{where}: the pose must be finite, got {row.tolist()}; calibrate again.")
-    pose = row[:15].reshape(3, 5).astype(np.float64)
-    down, right, back, centre, (height, width, focal) = pose.T
-    R = np.stack([right, down, -back])
-    viewmat = rigid(
-        f"{where}, columns in the order down, right, back", np.column_stack([R, -R @ centre])
-    )
-    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
-    try:
-        return Camera(K, viewmat, round(width), round(height), name)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+    if len(rows) != len(names):
+        raise ValueError(
+            f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
+            f"({', '.join(names)}); remove the rows of missing videos."
+        )
+    cameras = []
+    for i, (row, name) in enumerate(zip(rows.astype(np.float64), names, strict=True)):
+        with errors_at(f"{path}, row {i} ({name})"):
+            down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+            R = np.stack([right, down, -back])
+            pose = np.column_stack([R, -R @ centre])
+            viewmat = rigid("columns in the order down, right, back", pose)
+            K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+            cameras.append(Camera(K, viewmat, round(width), round(height), name))
+    return tuple(cameras), rows[:, 15:].astype(np.float64)
 
 
 def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.ndarray) -> None:
@@ -87,15 +66,9 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
 
     Raises:
         ValueError: a camera has two focal lengths or an off-centre principal point, which the
-            format cannot represent, or `bounds` is not [C, 2].
+            format cannot represent.
         OSError: the file could not be written.
     """
-    bounds = np.asarray(bounds, dtype=np.float64)
-    if bounds.shape != (len(cameras), 2):
-        raise ValueError(
-            f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got "
-            f"{bounds.shape}."
-        )
     rows = []
     for camera, near_far in zip(cameras, bounds, strict=True):
         K = camera.K
@@ -123,7 +96,8 @@ def _read_calibration(path: Path) -> Calibration:
     """
     source = path / "poses_bounds.npy"
     clips: Mapping[str, Clip] = required_clips(path)
-    if len(clips) != count_rows(source) == len(by_frame := clips_by_frame(path)):
+    count = read_array(source).shape[:1]
+    if (len(clips),) != count == (len(by_frame := clips_by_frame(path)),):
         check_frames(path, by_frame)
         clips = by_frame
     cameras, _ = read_poses_bounds(source, list(clips))

@@ -156,7 +156,7 @@ def _calibration_files(path: Path) -> list[Path]:
 def _read_calibration(path: Path) -> Calibration:
     source = only_calibration(path, _calibration_files(path), "one calibration in TOML")
     cameras, lenses = read_anipose(source)
-    return match_clips(path, source, required_clips(path), cameras, lenses).calibration
+    return match_clips(path, source, required_clips(path), cameras, lenses)[0]
 
 
 READER = Reader(

@@ -193,7 +193,7 @@ def _read_calibration(path: Path) -> Calibration:
     """Return the cameras that have a clip; marker cameras have none."""
     source = only_calibration(path, calibration_files(path, _PATTERN), "one file *.qca.txt")
     cameras, lenses = read_qualisys(source)
-    return match_clips(path, source, required_clips(path), cameras, lenses).calibration
+    return match_clips(path, source, required_clips(path), cameras, lenses)[0]
 
 
 READER = Reader(

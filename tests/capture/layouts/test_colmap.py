@@ -123,16 +123,16 @@ def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, 
             "cameras.txt",
             " OPENCV ",
             " PINHOLE ",
-            "camera 2: the camera model PINHOLE takes 4 parameters, got 8",
+            "camera 2: the camera model PINHOLE takes 4 parameters of at most .*, got 8",
         ),
         ("cameras.txt", f" {WIDTH} ", " wide ", "cameras.txt, line 2: expected `CAMERA_ID MODEL"),
         (
             "images.txt",
             " 2 cam01",
             " 9 cam01",
-            r"'cam01.png' refers to camera 9, cameras.txt has \[1, 2, 3\]",
+            r"'cam01.png': it refers to camera 9, of \[1, 2, 3\]; export the whole model",
         ),
-        ("cameras.txt", "-0.02", "nan", "cameras.txt: camera 2: its parameters must be finite"),
+        ("cameras.txt", "-0.02", "nan", "camera 2: the camera model OPENCV takes 8 parameters of"),
         ("images.txt", "\n\n", "\n", "images.txt, line 3: expected `POINTS2D"),
         (
             "images.txt",
@@ -140,10 +140,9 @@ def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, 
             "\n1 1 0 0 1",
             "image 'cam00.png': its quaternion must have length 1",
         ),
-        ("images.txt", r"\n1 \S+", "\n1 nan", "image 'cam00.png': the pose must be finite, got"),
+        ("images.txt", r"\n1 \S+", "\n1 nan", "image 'cam00.png': its quaternion must have"),
         ("images.txt", r"\n1 \S+", "\n1 word", "images.txt, line 2: expected `IMAGE_ID"),
         ("points3D.txt", "\n1 ", "\n1 red ", "points3D.txt, line 2: expected `POINT3D_ID"),
-        ("points3D.txt", "\n1 ", "\n1 inf ", "points3D.txt: the points must be finite"),
     ],
 )
 def test_read_colmap__refuses_broken_text(
@@ -163,7 +162,7 @@ def test_read_colmap__refuses_broken_text(
         (
             "cameras.txt",
             "1 PINHOLE 1 1 1 1 1 1 {}",
-            "camera 1: .* takes 4 parameters, got 16|expected `CAMERA_ID",
+            "camera 1: .* takes 4 parameters .*, got 16|expected `CAMERA_ID",
         ),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n{}", "expected `POINTS2D"),
         ("points3D.txt", "1 0 0 0 word 0 0 0 {}", "expected `POINT3D_ID"),
@@ -198,7 +197,8 @@ def test_read_colmap__refuses_a_binary_file_of_another_number_of_entries(
 
 def test_read_colmap__names_a_missing_file(tmp_path: Path) -> None:
     (write(tmp_path) / "images.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"images.txt is missing"):
+    message = r"images.txt: expected a file of a COLMAP model, found none"
+    with pytest.raises(FileNotFoundError, match=message):
         read_colmap(tmp_path)
 
 

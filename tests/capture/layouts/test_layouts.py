@@ -220,7 +220,7 @@ def test_load_capture__lists_some_of_many_cameras_without_clips(
     layouts.videos(tmp_path, names[:2])
     with caplog.at_level(logging.WARNING):
         assert load_capture(tmp_path).names == names[:2]
-    assert "cam11.png and 18 others: left out." in caplog.text
+    assert "cam11.png and 18 more: left out." in caplog.text
 
 
 def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:

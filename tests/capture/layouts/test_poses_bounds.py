@@ -62,11 +62,11 @@ def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
     [
         (
             lambda rows: np.where(np.arange(17) == 3, np.nan, rows),
-            r"row 0 \(cam00\): the pose must be finite",
+            r"row 0 \(cam00\): .*: the pose must be finite",
         ),
         (
             lambda rows: np.where(np.arange(17) % 5, rows, -rows),
-            r"row 0 \(cam00\), columns in the order down, right, back: the axes must be a "
+            r"row 0 \(cam00\): columns in the order down, right, back: the axes must be a "
             r"right-handed",
         ),
         (
@@ -93,5 +93,3 @@ def test_write_poses_bounds__refuses_cameras_that_the_format_cannot_represent(
     camera = Camera(K, np.eye(4), 64, 48, "cam00")
     with pytest.raises(ValueError, match=r"'cam00' must have one focal length .* use write_colmap"):
         write_poses_bounds(tmp_path / "p.npy", [camera], BOUNDS[:1])
-    with pytest.raises(ValueError, match=r"`bounds` must be \[C, 2\] with C=1, got \(2, 2\)"):
-        write_poses_bounds(tmp_path / "p.npy", [camera], BOUNDS)

@@ -300,7 +300,7 @@ def noise_clips(path: Path) -> None:
             lambda path: (path / "c.mkv").write_bytes(b""),
             {},
             ValueError,
-            "c.mkv: expected a video, got an empty file",
+            "c.mkv: expected a video, got 0 bytes",
         ),
         (
             lambda path: (path / "sparse").mkdir(),
