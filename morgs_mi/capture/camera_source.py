@@ -124,23 +124,3 @@ class CameraSource:
         if valid is None or valid.all():
             return None
         return scaled_mask(valid, camera.width, camera.height)
-
-
-def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
-    """Return the camera at the size of its clip, which may be a scaled version of the calibrated
-    size.
-
-    Raises:
-        ValueError: the clip has another aspect ratio.
-    """
-    if (reader.width, reader.height) == (camera.width, camera.height):
-        return camera
-    # Both sides were rounded to whole pixels.
-    difference = abs(camera.width * reader.height - camera.height * reader.width)
-    if difference > min(camera.width, camera.height):
-        raise ValueError(
-            f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of "
-            f"{camera.name}, or a scaled version of it, got {reader.width}x{reader.height}; "
-            "calibrate at the recorded size."
-        )
-    return camera.resized(reader.width, reader.height)

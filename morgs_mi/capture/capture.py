@@ -16,14 +16,14 @@ from typing import Any, cast
 
 import numpy as np
 
-from morgs_mi.capture.camera_source import CameraSource, at_clip_size
+from morgs_mi.capture.camera_source import CameraSource
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_points
+from morgs_mi.core.checks import check_points, few
 from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import with_near_planes
@@ -432,14 +432,28 @@ def load_capture(
 def _at_clip_sizes(
     path: Path, cameras: Sequence[Camera], readers: Sequence[FrameReader]
 ) -> list[Camera]:
-    """Return the cameras at the sizes of their clips, with a warning if a size differs."""
-    recorded = [at_clip_size(c, r) for c, r in zip(cameras, readers, strict=True)]
-    if scaled := [new for old, new in zip(cameras, recorded, strict=True) if new is not old]:
-        names = ", ".join(camera.name for camera in scaled)
+    """Return the cameras at the sizes of their clips, with a warning if a size differs.
+
+    Raises:
+        ValueError: a clip has another aspect ratio than its camera.
+    """
+    recorded = []
+    for camera, reader in zip(cameras, readers, strict=True):
+        width = reader.width
+        height = reader.height
+        # Both sides were rounded to whole pixels.
+        if abs(camera.width * height - camera.height * width) > min(camera.width, camera.height):
+            raise ValueError(
+                f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of "
+                f"{camera.name}, or a scaled version of it, got {width}x{height}."
+            )
+        recorded.append(camera.resized(width, height))
+    pairs = zip(cameras, recorded, strict=True)
+    if scaled := [new for old, new in pairs if (new.width, new.height) != (old.width, old.height)]:
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
             "intrinsics are scaled.",
-            *(path, names, scaled[0].width, scaled[0].height),
+            *(path, few([c.name for c in scaled]), scaled[0].width, scaled[0].height),
         )
     return recorded
 
@@ -488,8 +502,8 @@ def _downscaled_cameras(
         largest = _shortest_side(recorded) / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
         raise ValueError(
-            f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
-            f"side, got {downscale:g}; {remedy}."
+            f"load_capture(): `downscale` must leave at least {MIN_SIDE} pixels on each side, got "
+            f"{downscale:g}; {remedy}."
         )
     return cameras
 

@@ -63,9 +63,7 @@ def held_out_views(
     """
     indices = _indices(path, views, names)
     if len(indices) == len(names):
-        raise ValueError(
-            f"{path}: `test_view` must leave a camera for training, got all {len(names)} cameras."
-        )
+        raise ValueError(f"{path}: `test_view` must leave a camera for training, got all.")
     return indices
 
 
@@ -84,6 +82,6 @@ def _indices(
         else:
             raise ValueError(
                 f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "
-                f"{', '.join(names)}, or none for no held-out camera, got {view}."
+                f"{', '.join(names)}, or none, got {view}."
             )
     return tuple(sorted(indices))

@@ -55,8 +55,8 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
     """
     if model not in MODELS:
         raise ValueError(
-            f"the camera model must be one of {', '.join(MODELS)}, got {model}; "
-            "undistort the images with COLMAP's image_undistorter first."
+            f"the camera model must be one of {', '.join(MODELS)}, got {model}; undistort the "
+            "images with COLMAP's image_undistorter."
         )
     focals, coefficients = MODELS[model]
     count = 2 + focals + coefficients

@@ -35,7 +35,7 @@ def used_in_clip(
     notes = [note] if note else []
     width = reader.width
     height = reader.height
-    used = np.ones((height, width), bool)
+    used_mask = np.ones((height, width), bool)
     varies = False  # whether a later image masks out more than those before it
     for file in files:
         existing_file(file, "a mask", "copy it, or drop `mask_path`")
@@ -45,24 +45,23 @@ def used_in_clip(
         rows, columns = mask.shape
         if abs(columns * height - rows * width) > min(columns, rows, width, height):
             raise ValueError(
-                f"{file}: expected a mask of {width}x{height} pixels, or a scaled version of it, "
-                f"got {columns}x{rows}; make it again."
+                f"{file}: expected a mask of {width}x{height}, or scaled, got {columns}x{rows}."
             )
         mask = scaled_mask(mask, width, height)
-        varies = varies or (file != files[0] and bool((used & ~mask).any()))
-        used &= mask
-    if not used.all():
+        varies = varies or (file != files[0] and bool((used_mask & ~mask).any()))
+        used_mask &= mask
+    if not used_mask.all():
         several = f": all that any of {len(files)} different masks has black"
         origin = several if varies else f" by {files[0].name}"
-        notes.append(f"{name}: {_unused(used)} % of its pixels are masked out{origin}.")
+        notes.append(f"{name}: {_unused(used_mask)} % of its pixels are masked out{origin}.")
     if opaque is not None:
-        used &= opaque
-    if not used.any():
+        used_mask &= opaque
+    if not used_mask.any():
         raise ValueError(
             f"{files[0] if files else reader.path}: expected pixels of {name} that are used, got "
             "all black or transparent; correct the mask."
         )
-    return None if used.all() else used, notes
+    return None if used_mask.all() else used_mask, notes
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:

@@ -80,10 +80,7 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     try:
         x, y, depth, ids, mask = (channels[name] for name in _CHANNELS)
     except KeyError as error:
-        raise ValueError(
-            f"{path}: expected the channels {', '.join(_CHANNELS)}, got none called {error}; "
-            "synthesise the capture again."
-        ) from None
+        raise ValueError(f"{path}: expected a channel {error}; synthesise it again.") from None
     return GroundTruth(np.stack([x, y], axis=-1), depth, ids.astype(np.int32), mask > 0.5)
 
 

@@ -39,10 +39,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     """
     shapes = {name: np.shape(channel) for name, channel in channels.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
-        raise ValueError(
-            f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
-            "each."
-        )
+        raise ValueError(f"write_exr(): `channels` must share one shape [H, W], got {shapes}.")
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path, "write_exr()") as partial:
@@ -79,9 +76,7 @@ def read_light(path: str | Path) -> np.ndarray:
     """
     channels, header = _read(path)
     if abs((aspect := header.get("pixelAspectRatio", 1)) - 1) > _SAME:
-        raise ValueError(
-            f"{path}: expected square pixels, got the pixel aspect {aspect:g}; resample the image."
-        )
+        raise ValueError(f"{path}: expected square pixels, got the pixel aspect {aspect:g}.")
     light = np.stack([channels[name] for name in _color_names(path, channels)], axis=-1)
     primaries = header.get("chromaticities", _REC_709)
     if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
@@ -113,8 +108,7 @@ def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> list[s
     if not layers and "Y" in channels:
         return ["Y"] * 3
     raise ValueError(
-        f"{path}: expected the channels R, G, B, or Y, or one layer with R, G, B, got "
-        f"{', '.join(channels)}; rename them."
+        f"{path}: expected Y, or one layer with R, G, B, got {', '.join(channels)}; rename them."
     )
 
 
@@ -145,9 +139,7 @@ def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             }
             return channels, header
     except (RuntimeError, ValueError, struct.error) as error:
-        raise OSError(
-            f"read_exr(): cannot read {path}: {error}; the file may be truncated, write it again."
-        ) from error
+        raise OSError(f"cannot read {path}: {error}; the file may be truncated.") from error
 
 
 def _displayed(pixels: np.ndarray, header: Mapping[str, Any]) -> np.ndarray:
@@ -205,9 +197,7 @@ def _count_channels(data: bytes) -> int:
     while at < len(data) - 1:
         end = data.index(b"\0", at)  # of the name; the last 8 of 16 bytes are the sampling
         if data[end + 9 : end + 17] != b"\1\0\0\0" * 2:
-            raise ValueError(
-                f"it has fewer numbers than pixels in the channel {data[at:end].decode()}"
-            )
+            raise ValueError(f"its channel {data[at:end].decode()} has fewer numbers than pixels")
         at = end + 17
         count += 1
     return count

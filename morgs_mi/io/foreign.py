@@ -51,6 +51,14 @@ _FORMATS = (
     _CHECKPOINT,
     _ARCHIVE,
 )
+# Formats by the first bytes of their files.
+_STARTS = {
+    b"NGSP": _SPZ,
+    b"glTF": _GLTF,
+    b"PXR-USDC": _USD,
+    b"#usda": _USD,
+    b"\x93NUMPY": _NUMPY,
+}
 
 
 def refuse_foreign(path: str | Path) -> None:
@@ -76,8 +84,9 @@ def refuse_foreign(path: str | Path) -> None:
 
 def _by_content(head: bytes, name_format: _Format | None, name: str) -> _Format | None:
     """Return the format that begins with these bytes."""
-    if head[:4] == b"NGSP":
-        return _SPZ
+    for start, kind in _STARTS.items():
+        if head.startswith(start):
+            return kind
     if head[:2] == b"\x1f\x8b":
         with suppress(zlib.error):
             if zlib.decompressobj(wbits=31).decompress(head, 16)[:4] == b"NGSP":
@@ -85,12 +94,8 @@ def _by_content(head: bytes, name_format: _Format | None, name: str) -> _Format 
         return name_format or _ARCHIVE
     if head[:4] == b"PK\x03\x04":
         return _SOG if b"meta.json" in head else name_format or _ARCHIVE
-    if head[:4] == b"glTF" or b"KHR_gaussian_splatting" in head:
+    if b"KHR_gaussian_splatting" in head:
         return _GLTF
-    if head[:8] == b"PXR-USDC" or head[:5] == b"#usda":
-        return _USD
-    if head[:6] == b"\x93NUMPY":
-        return _NUMPY
     if head[:4] in (b"ply\n", b"ply\r") and not name.endswith(".ply"):
         return _PLY
     return None

@@ -62,8 +62,7 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     for number, name in zip(best, names, strict=True):
         if last[number] != name:
             raise ValueError(
-                f"{folder}: expected one file with the number {number}, got {name} and "
-                f"{last[number]}; remove or rename one."
+                f"{folder}: expected one file of number {number}, got {name} and {last[number]}."
             )
     return list(best)
 

@@ -123,8 +123,7 @@ def read_ply(path: str | Path) -> Gaussians:
     K = 1 + count // 3
     if count not in SH_DEGREES or not vertices.keys() >= {*rest_names(K)}:
         raise ValueError(
-            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 or none, got {count} of them; export "
-            "the Gaussians with SH of degree 3 or less."
+            f"{path}: expected f_rest_0 to f_rest_8, 23, 44 or none, got {count} of them."
         )
     coeffs = np.empty((len(vertices["x"]), K, 3), np.float32)
     coeffs[:, 0] = _table(vertices, _DC)

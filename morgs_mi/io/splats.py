@@ -59,8 +59,7 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     suffix = suffix_of(path)
     if suffix is None:
         raise ValueError(
-            f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got "
-            f"{path.suffix!r}; convert it."
+            f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, got {path.suffix!r}."
         )
     with path.open("rb") as file:
         header = file.read(4096).partition(b"end_header")[0]
@@ -77,8 +76,7 @@ def _read_splat(path: Path) -> Gaussians:
     size = path.stat().st_size
     if size % _RECORD.itemsize:
         raise ValueError(
-            f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes; "
-            "export it again."
+            f"{path}: expected {_RECORD.itemsize} bytes a Gaussian, got {size}; export it again."
         )
     records = np.fromfile(path, _RECORD)
     scales = np.where(records["scales"] >= 0, records["scales"], np.nan)

@@ -147,8 +147,8 @@ class VideoReader(_Frames):
                 periods = float(positions[-1] - positions[0])
                 if positions[-1] > 10 * num_held + _MAX_PAUSE:
                     raise ValueError(
-                        f"{path}: expected {num_held} frames at about {rate:.3g} per second, got "
-                        f"times that span {times[-1]:.3g} s; convert the clip."
+                        f"{path}: expected {num_held} frames at about {rate:.3g} fps, got times of "
+                        f"{times[-1]:.3g} s; convert the clip."
                     )
             fps = true_rate(fps, periods, float(times[-1]))
             # A header may have the length of another stream's last packet.
@@ -454,8 +454,7 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
             gap = int(np.argmax(steps))
             file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
             raise ValueError(
-                f"{file}: expected images numbered without large gaps, got this after number "
-                f"{numbers[gap]}; rename or remove it."
+                f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}."
             )
         timestamps = range(numbers[0], numbers[-1] + 1, step)
         for folder, files in zip(group, clips, strict=True):
@@ -503,9 +502,7 @@ def _read_image(file: Path) -> np.ndarray:
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
     image = decode_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(
-            f"{file}: expected 8 or 16 bits, got {image.dtype}; convert it to one, or to EXR."
-        )
+        raise ValueError(f"{file}: expected 8 or 16 bits, got {image.dtype}; convert it.")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -524,7 +521,5 @@ def decode_image(file: Path, mode: int) -> np.ndarray:
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     if image is None:
-        raise ValueError(
-            f"{file}: expected an image, got {len(data)} bytes that cannot be decoded."
-        )
+        raise ValueError(f"{file}: expected an image, got {len(data)} bytes of another kind.")
     return image

@@ -146,7 +146,7 @@ def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(
     ("without", "message"),
     [
         (("cam02", "cam09"), "`without` must name cameras of cam01, cam02, got cam09."),
-        (("cam02", "cam01"), "`without` must leave at least one camera, got all: cam01, cam02."),
+        (("cam02", "cam01"), "`without` must leave at least one camera, got all."),
     ],
 )
 def test_load_capture__refuses_to_leave_out_unknown_or_all_cameras(
@@ -207,15 +207,15 @@ def test_load_capture__refuses_broken_settings(tmp_path: Path, settings: str, me
     [
         (
             {"downscale": 2},
-            r"`downscale` must leave .* at least 32 pixels on each side, got 2; use at most 1.43",
+            r"`downscale` must leave at least 32 pixels on each side, got 2; use at most 1.43",
         ),
         ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
         ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
         ({"max_frames": 0}, "`max_frames` must be at least 1, got 0"),
-        ({"test_view": 2}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 2"),
+        ({"test_view": 2}, r"`test_view` must be an index in 0..1, one of .*, or none, got 2"),
         (
             {"test_view": [0, "cam02"]},
-            "`test_view` must leave a camera for training, got all 2 cameras",
+            "`test_view` must leave a camera for training, got all",
         ),
     ],
 )

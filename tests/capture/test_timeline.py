@@ -357,7 +357,8 @@ def test_open_clips__refuses_numbers_that_span_more_than_the_images(
     path = images(tmp_path / "c")
     (path / "cam_2" / "0003.png").rename(path / "cam_2" / f"{number}.png")
     with pytest.raises(
-        ValueError, match=rf"cam_2/{number}.png: expected images numbered without .* after number 3"
+        ValueError,
+        match=rf"cam_2/{number}.png: expected numbers without .* this one after 3",
     ):
         load_capture(path, reading=ReadConfig(gaps=True))
 

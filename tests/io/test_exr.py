@@ -127,7 +127,7 @@ def test_read_light__refuses_layers_that_it_cannot_choose_from_and_other_pixels(
         ValueError, match=r"or one layer with R, G, B, got left\.B, .*; rename them"
     ):
         read_light(write(tmp_path / "a.exr", layers))
-    with pytest.raises(ValueError, match=r"square pixels, got the pixel aspect 2; resample"):
+    with pytest.raises(ValueError, match=r"square pixels, got the pixel aspect 2"):
         read_light(write(tmp_path / "a.exr", channels_of(LIGHT), pixelAspectRatio=2.0))
 
 
@@ -136,7 +136,7 @@ def test_read_light__refuses_layers_that_it_cannot_choose_from_and_other_pixels(
     [
         (b"dataWindow", b"dataWindox", "its header lacks dataWindow"),
         (b"compression\0", b"a\0int\0\4\0\0\0\0\0\0\0" * 1000, "has 1000 attributes or more"),
-        (b"B\0\2\0\0\0\0\0\0\0\1", b"B\0\2\0\0\0\0\0\0\0\2", "fewer numbers .* channel B"),
+        (b"B\0\2\0\0\0\0\0\0\0\1", b"B\0\2\0\0\0\0\0\0\0\2", "channel B has fewer numbers"),
     ],
     ids=["no window", "many attributes", "subsampled"],
 )

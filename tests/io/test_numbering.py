@@ -31,9 +31,9 @@ def test_frame_numbers__are_those_that_change(names: list[str], numbers: list[in
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["0000_left", "0000_right"], "one file with the number 0, got 0000_left and 0000_right"),
-        (["7", "8", "07"], "one file with the number 7, got 7 and 07; remove or rename one"),
-        (["0_0", "0_1", "1_0", "1_1"], "one file with the number 0, got 0_0 and 1_0"),
+        (["0000_left", "0000_right"], "one file of number 0, got 0000_left and 0000_right"),
+        (["7", "8", "07"], "one file of number 7, got 7 and 07"),
+        (["0_0", "0_1", "1_0", "1_1"], "one file of number 0, got 0_0 and 1_0"),
         (["0000", "b"], "a number in each name, got b; rename it"),
     ],
 )

@@ -100,7 +100,7 @@ def test_read_ply__reads_gaussians_of_one_timestamp(tmp_path, more):
         (
             (),
             columns(*(f"f_rest_{i}" for i in range(72))),
-            "got 72 of them; export the Gaussians with SH of degree 3",
+            "23, 44 or none, got 72 of them",
         ),
         (("f_rest_8",), {}, "got 8 of them"),
     ],

@@ -45,7 +45,7 @@ def test_read_splats__reads_an_uncompressed_ply(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.splat", bytes(33), "expected 32 bytes for each Gaussian, got 33 bytes"),
+        ("a.splat", bytes(33), "expected 32 bytes a Gaussian, got 33"),
         (
             "a.splat",
             RECORD.pack(*(0,) * 14) + RECORD.pack(np.nan, *(0,) * 13),
@@ -58,7 +58,7 @@ def test_read_splats__reads_an_uncompressed_ply(tmp_path):
         ),
         ("a.ply", b"", "expected a complete PLY file, .* it does not begin with `ply`"),
         ("a.ply", b"ply\nformat ascii 1.0\n", "its header does not end"),
-        ("a.xyz", b"", r"name ends in .compressed.ply, .ply, .splat, got '.xyz'"),
+        ("a.xyz", b"", r"name that ends in .compressed.ply, .ply, .splat, got '.xyz'"),
     ],
 )
 def test_read_splats__names_what_is_broken(tmp_path, name, content, message):

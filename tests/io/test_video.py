@@ -299,7 +299,8 @@ def test_video_reader__names_an_unknown_codec(tmp_path: Path) -> None:
 def test_video_reader__refuses_time_stamps_of_years(tmp_path: Path) -> None:
     write_timed_video(tmp_path / "cam.mkv", clip(), [0, 33, 67, 100, 133, 200_000_000])
     with pytest.raises(
-        ValueError, match=r"cam.mkv: expected 6 frames at about 30.* that span 2e\+05 s; .*convert"
+        ValueError,
+        match=r"cam.mkv: expected 6 frames at .* fps, got times of 2e\+05 s; convert",
     ):
         VideoReader.open(tmp_path / "cam.mkv")
 

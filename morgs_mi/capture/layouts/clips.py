@@ -27,6 +27,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from morgs_mi.core.checks import few
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, images_in, listed
 from morgs_mi.io.numbering import check_numbering, frame_numbers
@@ -158,9 +159,7 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
     check_names(path, "without", without, names)
     rest = [name for name in names if name not in without]
     if without and not rest:
-        raise ValueError(
-            f"{path}: `without` must leave at least one camera, got all: {', '.join(names)}."
-        )
+        raise ValueError(f"{path}: `without` must leave at least one camera, got all.")
     return rest
 
 
@@ -172,8 +171,7 @@ def check_names(place: Path, setting: str, names: Iterable[str], cameras: Collec
     """
     if unknown := [name for name in names if name not in cameras]:
         raise ValueError(
-            f"{place}: `{setting}` must name cameras of {', '.join(cameras)}, got "
-            f"{', '.join(unknown)}."
+            f"{place}: `{setting}` must name cameras of {few([*cameras])}, got {few(unknown)}."
         )
 
 
@@ -271,8 +269,7 @@ def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
     for file in files:
         if (other := files_by_stem.setdefault(file.stem, file)) != file:
             raise ValueError(
-                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; "
-                "keep one of them, or rename it."
+                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}."
             )
     return files_by_stem
 

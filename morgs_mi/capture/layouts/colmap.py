@@ -39,7 +39,7 @@ from morgs_mi.capture.layouts.nerfstudio import read_points_ply
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import errors_at
+from morgs_mi.core.checks import errors_at, few
 from morgs_mi.core.files import write_error
 from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.video import natural_key
@@ -139,10 +139,7 @@ def _views(
     for name, camera_id, pose in (binary_images if path.suffix == ".bin" else text_images)(path):
         with errors_at(f"{path}, image {name!r}"):
             if camera_id not in intrinsics:
-                raise ValueError(
-                    f"it refers to camera {camera_id}, of {sorted(intrinsics)}; export the whole "
-                    "model."
-                )
+                raise ValueError(f"it refers to camera {camera_id}, of {few(sorted(intrinsics))}")
             lens, K, width, height = intrinsics[camera_id]
             views.append((Camera(K, _viewmat(pose), width, height, name), lens))
         check_claim(path, _CAMERA_BYTES * len(views), f"{len(views)} images")

@@ -76,8 +76,7 @@ def _expected(record: str, path: Path, number: int, line: str) -> Iterator[None]
         yield
     except (ValueError, IndexError):
         raise ValueError(
-            f"{path}, line {number}: expected `{record}`, got {line[:80]!r}; export the model "
-            "again."
+            f"{path}, line {number}: expected `{record}`, got {line[:80]!r}; export it again."
         ) from None
 
 
@@ -137,8 +136,7 @@ class _Bytes:
             yield
         if rest := len(self.data) - self.at:
             raise ValueError(
-                f"{self.path}: expected the {count} {what} that it announces, got {rest} more "
-                "bytes: the number or the file is broken; export the model again."
+                f"{self.path}: expected the {count} {what} it announces, got {rest} more bytes."
             )
 
     def take(self, record: str) -> tuple:
@@ -150,8 +148,8 @@ class _Bytes:
     def skip(self, count: int) -> None:
         if count > (rest := len(self.data) - self.at):
             raise ValueError(
-                f"{self.path}: expected {count} more bytes at byte {self.at}, got {rest}: the file "
-                "is truncated or broken; export the model again."
+                f"{self.path}: expected {count} more bytes at byte {self.at}, got {rest}; copy it "
+                "again."
             )
         self.at += count
 

@@ -40,10 +40,7 @@ def read_poses_bounds(
     """
     rows = read_array(path)
     if rows.shape[1:] != (17,) or rows.dtype.kind != "f":
-        raise ValueError(
-            f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it "
-            "again."
-        )
+        raise ValueError(f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}.")
     if len(rows) != len(names):
         raise ValueError(
             f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "

@@ -480,7 +480,7 @@ def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path: Path) -> No
     shutil.copy(path / "cam2.mkv", path / "cam2.mov")
     with pytest.raises(
         ValueError,
-        match=r"expected one file per camera, got cam2.mkv and cam2.mov; keep one of them",
+        match=r"expected one file per camera, got cam2.mkv and cam2.mov",
     ):
         load_capture(path)
     for suffix in (".png", ".jpg"):
