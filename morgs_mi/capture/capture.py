@@ -396,7 +396,12 @@ def load_capture(
     masks = calibration.masks or ((),) * len(readers)
     clips = zip(readers, calibration.lenses, recorded, masks, common.clips, strict=True)
     sources = tuple(CameraSource.of(*clip) for clip in clips)
-    readouts = _readouts(path, every.names, names, settings)
+    readout = settings.get("readout", 0.0)
+    if isinstance(readout, dict):
+        check_names(path / CAPTURE, "readout", readout, every.names)
+        readouts = [readout.get(name, 0.0) for name in names]
+    else:
+        readouts = [readout] * len(names)
     cameras = _downscaled_cameras(recorded, downscale, common.clips, readouts)
     cameras = with_near_planes(cameras, calibration.points, reading.near)
     capture = Capture(
@@ -456,21 +461,6 @@ def _at_clip_sizes(
             *(path, few([c.name for c in scaled]), scaled[0].width, scaled[0].height),
         )
     return recorded
-
-
-def _readouts(
-    path: Path, every: Sequence[str], names: Sequence[str], settings: dict[str, Any]
-) -> list[float]:
-    """Return the readout of each camera called `names`, out of `every`, in its clip's frames.
-
-    Raises:
-        ValueError: the settings name an unknown camera.
-    """
-    readout = settings.get("readout", 0.0)
-    if not isinstance(readout, dict):
-        return [readout] * len(names)
-    check_names(path / CAPTURE, "readout", readout, every)
-    return [readout.get(name, 0.0) for name in names]
 
 
 def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ in COLMAP's order. OpenCV puts pixel centres at integers, COLMAP and `Camera` at
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -76,13 +76,10 @@ def opencv_lens(coefficients: Sequence[float]) -> Lens:
     """Return the lens with OpenCV's coefficients k1 k2 p1 p2, or k1 k2 p1 p2 k3, or k1 k2 p1 p2 k3
     k4 k5 k6.
     """
-    first = tuple(map(float, coefficients[:4]))
-    more = tuple(map(float, coefficients[4:]))
-    return (
-        Lens("FULL_OPENCV", (*first, *more, *(0.0,) * (4 - len(more))))
-        if any(more)
-        else Lens("OPENCV", first)
-    )
+    values = tuple(map(float, coefficients))
+    if any(values[4:]):
+        return Lens("FULL_OPENCV", values + (0.0,) * (8 - len(values)))
+    return Lens("OPENCV", values[:4])
 
 
 @dataclass(frozen=True)
@@ -115,8 +112,7 @@ def undistortion(
         refined: intrinsics of the view instead of the camera's, and the distortion that `lens`
             leaves in its images.
     """
-    stages = [(camera, lens)] if any(lens.distortion) else []
-    stages += [refined] if refined is not None and any(refined[1].distortion) else []
+    stages = [stage for stage in ((camera, lens), refined) if stage and any(stage[1].distortion)]
     if not stages:
         return None
     x, y, mask = _maps(*stages[0])
@@ -161,14 +157,12 @@ def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
     (x_down, x_right), (y_down, y_right) = map(np.gradient, coarse)
     fold = x_right * y_down - x_down * y_right <= 0
     # Distance from the optical axis at depth 1: x depends on the column only, y on the row only.
-    columns, rows = (np.arange(n) + 0.5 for n in (camera.width, camera.height))
-    across = image_coordinates(camera, np.stack([columns, columns], axis=1))[:, 0]
-    down = image_coordinates(camera, np.stack([rows, rows], axis=1))[:, 1]
+    across = (np.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    down = (np.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     radius = np.hypot(across, down[:, None])
     return radius >= np.min(radius[::step, ::step][fold], initial=np.inf)
 
 
 def image_coordinates(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Return the image coordinates x / z, y / z [n, 2] of pixels, in the camera's axes."""
-    local = replace(camera, viewmat=np.eye(4))
-    return local.unproject(pixels, np.ones(len(pixels)))[:, :2]
+    return (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]

@@ -4,7 +4,9 @@ A timestamp t = 0, 1, ... is a frame of the recording. It is shown by frame k of
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
-Folders of images have an o and r by the numbers of their images, too (see `image_numbers`).
+Folders of images have an o and r by the numbers of their images, too. The numbers are times: images
+with the same number are simultaneous. Cameras whose numbers do not overlap, such as 1000 to 1010
+and 2340 to 2350, count separately, and the first images of such cameras are simultaneous.
 
 In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows
 the timestamp. If o is not whole, the clip has no frame of the timestamp. With a whole r, the
@@ -15,20 +17,21 @@ nearest frame is used unchanged: it is always later by the same time, the camera
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import lcm
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from morgs_mi.capture.image_numbers import ImageNumbers, align_numbers
 from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.config import config_class
+from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.unread import warn_unread
-from morgs_mi.io.video import FrameReader
+from morgs_mi.io.video import FolderReader, FrameReader
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
@@ -110,7 +113,7 @@ def timeline(
             camera or has an offset that is not finite.
     """
     check_names(path, "offset", config.offset, names)
-    numbers = align_numbers(path, names, readers, config.trim, config.offset)
+    numbers = _align_numbers(path, names, readers, config.trim, config.offset)
     for note in numbers.notes:
         _LOG.warning("%s: %s", path, note)
     exact = _clocks(names, readers, config, fps, numbers)
@@ -129,6 +132,84 @@ def timeline(
     )
     notes = [note for clip_notes in map(_notes, readers, clips) for note in clip_notes]
     return Timeline(tuple(clips), clocks.fps, unchanged, (*numbers.notes, *notes))
+
+
+@dataclass(frozen=True)
+class _ImageNumbers:
+    """Alignment of clips by the numbers of their images: image o + r t shows timestamp t."""
+
+    offsets: np.ndarray  #: o of each clip [C].
+    rates: np.ndarray  #: r of each clip [C].
+    #: Time between two timestamps, in frames of the clip with the most frames per time.
+    interval: float = 1.0
+    notes: tuple[str, ...] = ()  #: A sentence for each assumption.
+
+
+def _align_numbers(
+    path: Path,
+    names: Sequence[str],
+    readers: Sequence[FrameReader],
+    trim: bool,
+    offset: Mapping[str, float],
+) -> _ImageNumbers:
+    """Return the alignment of clips by the numbers of their images, without `trim` by `offset`."""
+    numbers = {
+        c: r.numbers
+        for c, r in enumerate(readers)
+        if isinstance(r, FolderReader) and r.numbers is not None
+    }
+    groups = counting_together(numbers)
+    notes: tuple[str, ...] = ()
+    if len(groups) > 1 and any(len(clip_numbers) > 1 for clip_numbers in numbers.values()):
+        table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
+        notes = (
+            f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin "
+            "at the same time.",
+        )
+    by_position = _ImageNumbers(np.zeros(len(readers)), np.ones(len(readers)), notes=notes)
+    different = [
+        group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1
+    ]
+    if not different:
+        return by_position
+    table = "; ".join(_table(names, numbers, group) for group in different)
+    if offset and not trim:
+        note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
+        return replace(by_position, notes=(*notes, note))
+    group = {c: numbers[c] for c in different[0]}
+    common = sorted(set.intersection(*map(set, group.values()))) if len(different) == 1 else []
+    if not trim or not common:
+        remedy = f"the {len(common)} common ones with --trim, " if common else ""
+        raise ValueError(
+            f"{path}: images with the same number must be simultaneous and all cameras must have "
+            f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
+            "out the cameras that lack an image, or the positions of the images in place of "
+            f"their numbers with --offset {names[different[0][0]]} 0."
+        )
+    note = (
+        f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
+        "all cameras have."
+    )
+    steps = [clip.step for clip in group.values()]
+    # Other clips start with the first of these numbers.
+    first = min(clip[0] for clip in group.values())
+    clips = [group.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
+    offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
+    rates = np.array([lcm(*steps) / clip.step for clip in clips])
+    return _ImageNumbers(offsets, rates, lcm(*steps) / min(steps), (*notes, note))
+
+
+def _table(names: Sequence[str], numbers: Mapping[int, range], group: Sequence[int]) -> str:
+    """Return the numbers of the cameras in a group."""
+    return ", ".join(f"{names[c]} {_range(numbers[c])}" for c in group)
+
+
+def _range(numbers: Sequence[int]) -> str:
+    if len(numbers) == 1:
+        return str(numbers[0])
+    text = f"{numbers[0]} to {numbers[-1]}"
+    step = numbers[1] - numbers[0]
+    return text if step == 1 else f"{text} by {step}"
 
 
 def _timestamps(
@@ -217,7 +298,7 @@ def _clocks(
     readers: Sequence[FrameReader],
     config: ReadConfig,
     fps: float | None,
-    numbers: ImageNumbers,
+    numbers: _ImageNumbers,
 ) -> _Clocks:
     """Return the clocks of the clips by their offsets, their frame rates and the numbers of their
     images.

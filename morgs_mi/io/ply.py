@@ -6,11 +6,16 @@ One vertex per Gaussian with float properties: ``x y z``, ``nx ny nz`` (zeros), 
 ``scale_0..2`` (natural logarithms of the standard deviations), ``rot_0..3`` (w, x, y, z). World
 axes stay as they are; the layout does not prescribe any.
 
-Mitsuba's shape `ellipsoids` reads this layout, and one with further attributes, see `mitsuba_ply`.
+Mitsuba's shape `ellipsoids` reads this layout, and one with all attributes: it makes an attribute
+NAME of adjacent properties ``NAME_0``, ``NAME_1``, ... between ``nx ny nz`` and ``scale_0``. Their
+values are activated, as the integrators read them: opacities and confidence in [0, 1], and SH with
+coefficient k of colour component j at 3 k + j. Names and shapes are those of the table of
+attributes.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,10 +26,10 @@ from typing import BinaryIO, Literal
 import numpy as np
 from plyfile import PlyData, PlyElement
 
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.listing import existing_file
-from morgs_mi.io.mitsuba_ply import from_mitsuba, mitsuba_columns
 from morgs_mi.io.ply_kinds import as_3dgs
 
 _MEAN = ("x", "y", "z")
@@ -51,6 +56,12 @@ _BOUNDS = {"opacity": (-99, 99), **dict.fromkeys(_SCALE, (-69, None))}
 SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}
 """Degrees of SH by the number of properties ``f_rest_*``."""
 
+# Attributes of the layout of Mitsuba whose properties have other names than in the other layout.
+_MITSUBA = {
+    name: attribute
+    for name, attribute in BY_ACTIVATED_NAME.items()
+    if name not in ("means", "scales", "quats")
+}
 _NORMAL = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 
@@ -81,10 +92,13 @@ def write_ply(
     # A zero quaternion is no rotation.
     rotations = np.where(lengths > 0, unit_quats, (1, 0, 0, 0))
     columns = {_MEAN: raw["means"], _NORMAL: np.zeros_like(raw["means"])}
+    N, K = raw["sh_coeffs"].shape[:2]
     if layout == "mitsuba":
-        columns |= mitsuba_columns(gaussians)
+        for name in ("sh_coeffs", *_MITSUBA):
+            if (values := getattr(gaussians, name)) is not None:
+                table = np.array(values).reshape(N, math.prod(values.shape[1:]))
+                columns[tuple(f"{name}_{i}" for i in range(table.shape[1]))] = table
     else:
-        N, K = raw["sh_coeffs"].shape[:2]
         columns[_DC] = raw["sh_coeffs"][:, 0]
         rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
         columns[rest_names(K)] = rest
@@ -111,31 +125,43 @@ def read_ply(path: str | Path) -> Gaussians:
         ValueError: it is not a PLY file, is truncated, lacks a property, or holds another kind of
             Gaussians.
     """
-    vertices, more = from_mitsuba(read_vertices(path))
-    vertices = as_3dgs(path, vertices)
-    expected = (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION)
+    vertices = read_vertices(path)
+    is_mitsuba = vertices.keys() >= {"sh_coeffs_0", "opacities_0"}
+    sh_names = [name for name in vertices if name.startswith(("sh_coeffs_", "f_dc_", "f_rest_"))]
+    K = len(sh_names) // 3
+    attributes: dict[str, np.ndarray] = {}
+    if is_mitsuba:
+        sh_order = [f"sh_coeffs_{i}" for i in range(3 * K)]
+        expected = (*_MEAN, *_SCALE, *_ROTATION)
+        for name, attribute in _MITSUBA.items():
+            names = [f"{name}_{i}" for i in range(attribute.width)]
+            if vertices.keys() >= {*names}:
+                values = np.stack([vertices[column] for column in names], axis=1)
+                values = values.reshape(len(values), *attribute.shape)
+                attributes[attribute.name] = attribute.activation.inverse(values)
+    else:
+        vertices = as_3dgs(path, vertices)
+        rest = np.reshape(rest_names(max(K, 1)), (3, -1)).T
+        sh_order = [*_DC, *rest.ravel().tolist()]
+        expected = (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION)
     if missing := [name for name in expected if name not in vertices]:
         raise ValueError(
             f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices "
             f"without {', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
         )
-    count = sum(name.startswith("f_rest_") for name in vertices)
-    K = 1 + count // 3
-    if count not in SH_DEGREES or not vertices.keys() >= {*rest_names(K)}:
+    count = len(sh_names) - 3
+    if count not in SH_DEGREES or {*sh_order} != {*sh_names}:
         raise ValueError(
             f"{path}: expected f_rest_0 to f_rest_8, 23, 44 or none, got {count} of them."
         )
-    coeffs = np.empty((len(vertices["x"]), K, 3), np.float32)
-    coeffs[:, 0] = _table(vertices, _DC)
-    rest = _table(vertices, rest_names(K)).reshape(len(coeffs), 3, K - 1)
-    coeffs[:, 1:] = rest.transpose(0, 2, 1)
+    if not is_mitsuba:
+        attributes["logit_opacities"] = _table(vertices, ("opacity",))[:, 0]
     return Gaussians(
         _table(vertices, _MEAN),
         _table(vertices, _SCALE),
         _table(vertices, _ROTATION),
-        _table(vertices, ("opacity",))[:, 0],
-        coeffs,
-        **more,
+        sh_coeffs=_table(vertices, sh_order).reshape(-1, K, 3),
+        **attributes,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 from collections.abc import Generator, Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TypeVar
@@ -14,11 +15,11 @@ _POLL_SECONDS = 0.1  # interval at which the thread checks whether the consumer 
 _CLOSING_SECONDS = 12.0  # longest wait for the thread; a connection may take 10 s to break
 
 
+@dataclass
 class _End:
     """Marker of the iterator's end, with the `error` that it raised."""
 
-    def __init__(self, error: BaseException | None = None) -> None:
-        self.error = error
+    error: BaseException | None
 
 
 def prefetched(
