@@ -70,22 +70,17 @@ class CameraSource:
         missing image.
         """
         indices = self.times.frame_indices[start:stop]
-        if self.times.shares is not None:
-            yield from self._interpolated(camera, indices, self.times.shares[start:stop])
+        if self.times.shares is None:
+            frames = self.reader.pick(indices[indices >= 0].tolist())
+            for timestamp, index in enumerate(indices, start):
+                if index < 0:
+                    yield ValueError(f"{self.reader.path}: no frame at timestamp {timestamp}.")
+                    continue
+                image = next(frames)
+                yield self.process(image, camera) if isinstance(image, np.ndarray) else image
             return
-        frames = self.reader.pick(indices[indices >= 0].tolist())
-        for timestamp, index in enumerate(indices, start):
-            if index < 0:
-                yield ValueError(f"{self.reader.path}: no frame at timestamp {timestamp}.")
-                continue
-            image = next(frames)
-            yield self.process(image, camera) if isinstance(image, np.ndarray) else image
-
-    def _interpolated(
-        self, camera: Camera, indices: np.ndarray, shares: np.ndarray
-    ) -> Generator[ImageOrError, None, None]:
         frames = self.reader.pick(np.stack([indices, indices + 1], axis=1).ravel().tolist())
-        for share in shares:
+        for share in self.times.shares[start:stop]:
             first = next(frames)
             second = next(frames)
             if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):

@@ -28,7 +28,7 @@ from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.io.video import Clip, FrameReader, ImageOrError, open_clips
+from morgs_mi.io.video import FrameReader, ImageOrError, open_clips
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
@@ -316,28 +316,21 @@ class Capture:
                 problems = tuple(f"{name}: {error}" for name, error in errors.items())
                 recorded = None
                 if index == 0 and any(source.times.delay for source in self._sources):
+                    # The motion in the first frame is unknown, so delays cannot be rendered. An
+                    # image that cannot be interpolated stays as it is.
                     recorded = images
-                    images = self._at_first_timestamp(images)
+                    first_images = list(images)
+                    for view, source in enumerate(self._sources):
+                        if images[view] is not None and source.times.delay:
+                            source = source.at_timestamps()
+                            result = next(source.images(self.cameras[view], 0, 1))
+                            if isinstance(result, np.ndarray):
+                                first_images[view] = result
+                    images = tuple(first_images)
                 yield PartialFrame(index, images, problems, recorded, unread)
         finally:
             for stream in streams:
                 stream.close()
-
-    def _at_first_timestamp(
-        self, images: Sequence[np.ndarray | None]
-    ) -> tuple[np.ndarray | None, ...]:
-        """Return the images of the first frame, interpolated at its timestamp.
-
-        The motion in the first frame is unknown, so delays cannot be rendered. An image that cannot
-        be interpolated stays as it is.
-        """
-        first_images = list(images)
-        for view, source in enumerate(self._sources):
-            if first_images[view] is not None and source.times.delay:
-                result = next(source.at_timestamps().images(self.cameras[view], 0, 1))
-                if isinstance(result, np.ndarray):
-                    first_images[view] = result
-        return tuple(first_images)
 
 
 def _masks(
@@ -404,6 +397,12 @@ def load_capture(
         readouts = [readout] * len(names)
     cameras = _downscaled_cameras(recorded, downscale, common.clips, readouts)
     cameras = with_near_planes(cameras, calibration.points, reading.near)
+    photos = [clip[0] for clip in calibration.clips if isinstance(clip, tuple) and len(clip) == 1]
+    notes = ()
+    if len(photos) == len(readers) and len({file.parent for file in photos}) == 1:
+        notes = (
+            f"{len(photos)} photos of a static scene, one per camera; a recording has {EXAMPLE}",
+        )
     capture = Capture(
         path=path,
         cameras=cameras,
@@ -422,7 +421,7 @@ def load_capture(
         notes=(
             *common.notes,
             *(note for source in sources for note in source.notes),
-            *_photos(calibration.clips),
+            *notes,
         ),
         origin=calibration.origin,
     )
@@ -461,14 +460,6 @@ def _at_clip_sizes(
             *(path, few([c.name for c in scaled]), scaled[0].width, scaled[0].height),
         )
     return recorded
-
-
-def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
-    """Return a note if the clips are the photos in one folder."""
-    files = [clip[0] for clip in clips if isinstance(clip, tuple) and len(clip) == 1]
-    if len(files) < len(clips) or len({file.parent for file in files}) > 1:
-        return ()
-    return (f"{len(files)} photos of a static scene, one per camera; a recording has {EXAMPLE}",)
 
 
 def _downscaled_cameras(

@@ -90,28 +90,22 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is
     not readable.
     """
+    mask = np.ones(shape, bool)
     with suppress(ValueError, OSError):
-        mask = _opaque_in_file(file)
-        if mask is not None and mask.shape == shape:
-            return mask
-    return np.ones(shape, bool)
-
-
-def _opaque_in_file(file: Path) -> np.ndarray | None:
-    """Return the mask of an image's opaque pixels [H, W], None without an alpha channel."""
-    with file.open("rb") as stream:
-        header = stream.read(26)
-    if header.startswith(b"\x76\x2f\x31\x01"):
-        return opaque_light(file)
-    # JPEG has no alpha channel, and the one of BMP is no mask. PNG may have one if its colour type
-    # is 3 (palette), 4 (grey and alpha) or 6 (RGB and alpha).
-    is_png = header.startswith(b"\x89PNG")
-    if header.startswith((b"\xff\xd8", b"BM")) or (
-        is_png and header[25:] not in (b"\3", b"\4", b"\6")
-    ):
-        return None
-    image = decode_image(file, cv2.IMREAD_UNCHANGED)
-    return image[..., 3] == np.iinfo(image.dtype).max if image.shape[2:] == (4,) else None
+        with file.open("rb") as stream:
+            header = stream.read(26)
+        # JPEG has no alpha channel, and the one of BMP is no mask. PNG may have one if its colour
+        # type is 3 (palette), 4 (grey and alpha) or 6 (RGB and alpha).
+        has_none = header.startswith((b"\xff\xd8", b"BM")) or (
+            header.startswith(b"\x89PNG") and header[25:] not in (b"\3", b"\4", b"\6")
+        )
+        if header.startswith(b"\x76\x2f\x31\x01"):
+            mask = opaque_light(file)
+        elif not has_none:
+            image = decode_image(file, cv2.IMREAD_UNCHANGED)
+            if image.shape[2:] == (4,):
+                mask = image[..., 3] == np.iinfo(image.dtype).max
+    return mask if mask.shape == shape else np.ones(shape, bool)
 
 
 def scaled_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -130,8 +130,19 @@ def timeline(
     unchanged = not any(config.offset.values()) and all(
         np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices))) for clip in clips
     )
-    notes = [note for clip_notes in map(_notes, readers, clips) for note in clip_notes]
-    return Timeline(tuple(clips), clocks.fps, unchanged, (*numbers.notes, *notes))
+    notes = [*numbers.notes]
+    for reader, clip in zip(readers, clips, strict=True):
+        if reader.positions is not None and reader.fps:
+            frames = clip.frame_indices[clip.frame_indices >= 0]
+            repeats = len(frames) - len(np.unique(frames))
+            late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
+            notes.append(
+                f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
+                f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to "
+                f"{1e3 * late:.1f} ms off; each timestamp has the frame nearest in time: {repeats} "
+                f"repeat one, {len(timestamps) - len(frames)} have none."
+            )
+    return Timeline(tuple(clips), clocks.fps, unchanged, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -342,7 +353,13 @@ def _common_timestamps(
     clocks: _Clocks,
 ) -> np.ndarray:
     """Return the timestamps that all clips cover [T]."""
-    lengths = np.array([_usable_periods(reader, config) for reader in readers])
+    # A truncated clip can be trimmed but not shifted.
+    is_held = config.trim and not config.gaps
+    for reader in () if config.gaps or config.trim else readers:
+        _check_complete(reader, reader.num_frames)
+    lengths = np.array(
+        [r.num_held if is_held and r.positions is None else _periods(r) for r in readers]
+    )
     first = np.ceil(np.max(-clocks.offsets / clocks.rates))
     last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
     if last < first:
@@ -362,40 +379,11 @@ def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
     return np.searchsorted((reader.positions[1:] + reader.positions[:-1]) / 2, positions)
 
 
-def _notes(reader: FrameReader, clip: ClipTimes) -> tuple[str, ...]:
-    """Return a note on a clip of variable frame rate."""
-    if reader.positions is None:
-        return ()
-    assert reader.fps
-    indices = clip.frame_indices
-    frames = indices[indices >= 0]
-    repeats = len(frames) - len(np.unique(frames))
-    late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
-    return (
-        f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
-        f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; "
-        f"each timestamp has the frame nearest in time: {repeats} repeat one, "
-        f"{len(indices) - len(frames)} have none.",
-    )
-
-
 def _periods(reader: FrameReader) -> int:
     """Return the number of positions that a clip covers: its number of frames if their rate is
     constant.
     """
     return reader.num_frames if reader.positions is None else round(reader.positions[-1]) + 1
-
-
-def _usable_periods(reader: FrameReader, config: ReadConfig) -> int:
-    """Return the number of positions that can be read; a truncated clip can be trimmed but not
-    shifted.
-    """
-    if not config.gaps:
-        if not config.trim:
-            _check_complete(reader, reader.num_frames)
-        elif reader.positions is None:
-            return reader.num_held
-    return _periods(reader)
 
 
 def _check_complete(reader: FrameReader, required: int) -> None:

@@ -95,10 +95,17 @@ def _chunks(raw: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarra
     chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in names])
     fractions = {}
     for key, value in values.items():
-        low, high, fractions[key] = _within_chunks(value.astype(np.float32))
-        for names, ends in zip(_BOUNDS[key], (low, high), strict=True):
+        value = value.astype(np.float32)
+        bounds = []
+        for names, bound in zip(_BOUNDS[key], (np.minimum, np.maximum), strict=True):
+            ends = value
+            if len(value):
+                ends = bound.reduceat(value, np.arange(0, len(value), _CHUNK), axis=0)
             for name, column in zip(names, ends.T, strict=True):
                 chunks[name] = column
+            bounds.append(_by_row(ends, len(value)))
+        low, high = bounds
+        fractions[key] = (value - low) / np.where(high > low, high - low, 1)
     return chunks, fractions
 
 
@@ -157,18 +164,6 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
     quats = _unpacked_rotations(vertices["packed_rotation"])
     with np.errstate(over="ignore"):  # infinite, and therefore invalid
         return Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
-
-
-def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bounds of the chunks [chunks, 3], twice, and the values [N, 3] as fractions
-    between them.
-    """
-    starts = np.arange(0, len(values), _CHUNK)
-    if not len(starts):
-        return values, values, values
-    low, high = (bound.reduceat(values, starts, axis=0) for bound in (np.minimum, np.maximum))
-    first, last = (_by_row(bound, len(values)) for bound in (low, high))
-    return low, high, (values - first) / np.where(last > first, last - first, 1)
 
 
 def _between(chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ in linear light.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -80,7 +80,15 @@ def read_light(path: str | Path) -> np.ndarray:
     light = np.stack([channels[name] for name in _color_names(path, channels)], axis=-1)
     primaries = header.get("chromaticities", _REC_709)
     if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
-        light = light @ _to_rec_709(primaries).T
+        # The import takes a second, for which other images should not wait.
+        from colour import RGB_Colourspace, matrix_RGB_to_RGB
+
+        spaces = (
+            RGB_Colourspace("", np.reshape(xy[:6], (3, 2)), np.array(xy[6:]))
+            for xy in (primaries, _REC_709)
+        )
+        matrix = matrix_RGB_to_RGB(*spaces, chromatic_adaptation_transform="Bradford")
+        light = light @ matrix.astype(np.float32).T
     return positive_light(light, f"{path}: its image")
 
 
@@ -110,20 +118,6 @@ def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> list[s
     raise ValueError(
         f"{path}: expected Y, or one layer with R, G, B, got {', '.join(channels)}; rename them."
     )
-
-
-def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
-    """Return the matrix [3, 3] that converts linear RGB from primaries in the form of `_REC_709` to
-    Rec. 709.
-    """
-    # The import takes a second, for which other images should not wait.
-    from colour import RGB_Colourspace, matrix_RGB_to_RGB
-
-    spaces = (
-        RGB_Colourspace("", np.reshape(xy[:6], (3, 2)), np.array(xy[6:]))
-        for xy in (primaries, _REC_709)
-    )
-    return matrix_RGB_to_RGB(*spaces, chromatic_adaptation_transform="Bradford").astype(np.float32)
 
 
 def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -173,7 +167,16 @@ def _check_size(path: str | Path) -> None:
         if part.get(b"type", b"").startswith(b"deep"):
             raise ValueError("it has deep pixels, which are not supported")
         width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
-        channels = _count_channels(part[b"channels"])
+        # A name that ends in 0 and 16 bytes for each channel, of which the last 8 are the sampling.
+        data = part[b"channels"]
+        channels = at = 0
+        while at < len(data) - 1:
+            end = data.index(b"\0", at)
+            if data[end + 9 : end + 17] != b"\1\0\0\0" * 2:
+                name = data[at:end].decode()
+                raise ValueError(f"its channel {name} has fewer numbers than pixels")
+            at = end + 17
+            channels += 1
         numbers += width * height * channels
         contents.append(f"{width}x{height} pixels of {channels} channels")
     check_claim(path, 4 * numbers, " and ".join(contents))
@@ -189,18 +192,6 @@ def _header(file: BinaryIO) -> dict[bytes, bytes]:
         (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
         attributes[name] = file.read(size)
     raise ValueError(f"its header has {_MOST_ATTRIBUTES} attributes or more")
-
-
-def _count_channels(data: bytes) -> int:
-    """Return the number of channels in a list of channels."""
-    count = at = 0
-    while at < len(data) - 1:
-        end = data.index(b"\0", at)  # of the name; the last 8 of 16 bytes are the sampling
-        if data[end + 9 : end + 17] != b"\1\0\0\0" * 2:
-            raise ValueError(f"its channel {data[at:end].decode()} has fewer numbers than pixels")
-        at = end + 17
-        count += 1
-    return count
 
 
 def _string(file: BinaryIO) -> bytes:

@@ -57,7 +57,16 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
             faults.append(f"{_WORDS.get(name, name)} of {numbers}")
         every &= rows
     count = int(N - every.sum())
-    _warn_far(path, raw["means"][every], raw["log_scales"][every])
+    if every.any():
+        middle = np.median(raw["means"][every], axis=0)
+        size = np.exp(np.median(raw["log_scales"][every]))
+        if 10 * np.spacing(np.abs(middle)).max() > size:
+            _log.warning(
+                "%s: the centres, around (%g, %g, %g), are so far from 0 that float32 rounds them "
+                "by a tenth of the Gaussians' sizes or more; subtract an origin before they are "
+                "exported.",
+                *(path, *middle),
+            )
     if not count:
         return gaussians
     details = "; ".join(faults)
@@ -72,16 +81,3 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         *(path, count, N, LARGEST, details),
     )
     return gaussians.select(every)
-
-
-def _warn_far(path: str | Path, means: np.ndarray, log_scales: np.ndarray) -> None:
-    """Warn of means [N, 3] that float32 rounds by a tenth of the Gaussians' sizes or more."""
-    if not len(means):
-        return
-    middle = np.median(means, axis=0)
-    if 10 * np.spacing(np.abs(middle)).max() > np.exp(np.median(log_scales)):
-        _log.warning(
-            "%s: the centres, around (%g, %g, %g), are so far from 0 that float32 rounds them by a "
-            "tenth of the Gaussians' sizes or more; subtract an origin before they are exported.",
-            *(path, *middle),
-        )

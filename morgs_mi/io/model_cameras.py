@@ -9,15 +9,14 @@ right, y down, z forward), `fx` and `fy` in pixels; the principal point is the m
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import errors_at
 from morgs_mi.io.unread import warn_unread
 
-_FILE = "cameras.json"
 _KEYS = {"width", "height", "position", "rotation", "fx", "fy"}
 _HARMLESS = {"id", "img_name", "image_name", "name", "near", "far"}
 # Cameras that are kept, evenly spaced in the file: more are of no use to a viewer.
@@ -34,34 +33,25 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
     Raises:
         ValueError: an entry is broken.
     """
-    folders = path.resolve().parents[:3]
-    for file in (folder / _FILE for folder in folders):
-        if file.is_file() and _are_cameras(rows := read_json(file)):
-            warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
-            indices = range(0, len(rows), -(-len(rows) // _MOST))
-            return file, tuple(_camera(file, i, rows[i]) for i in indices)
+    for folder in path.resolve().parents[:3]:
+        file = folder / "cameras.json"
+        rows = read_json(file) if file.is_file() else None
+        if not rows or not isinstance(rows, list):
+            continue
+        if not all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows):
+            continue
+        warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
+        cameras = []
+        for i in range(0, len(rows), -(-len(rows) // _MOST)):
+            row = rows[i]
+            with errors_at(f"{file}: entry {i}"):
+                R = np.asarray(row["rotation"], np.float64)
+                viewmat = np.eye(4)
+                viewmat[:3, :3] = R.T
+                viewmat[:3, 3] = -R.T @ np.asarray(row["position"], np.float64)
+                width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
+                K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+                name = str(row.get("img_name", i))
+                cameras.append(Camera(K, viewmat, round(width), round(height), name))
+        return file, tuple(cameras)
     return None, ()
-
-
-def _are_cameras(rows: Any) -> bool:
-    """Return whether the content of a file is a list of cameras."""
-    return (
-        isinstance(rows, list)
-        and len(rows) > 0
-        and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows)
-    )
-
-
-def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
-    try:
-        R = np.asarray(row["rotation"], np.float64)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = R.T
-        viewmat[:3, 3] = -R.T @ np.asarray(row["position"], np.float64)
-        width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
-        K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
-        return Camera(K, viewmat, round(width), round(height), str(row.get("img_name", index)))
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{file}: entry {index}: expected a camera, got a broken one: {error}"
-        ) from None

@@ -94,11 +94,7 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     if names and (folder, names) not in _named:
         _named.add((folder, names))
         _log.warning("%s: it is drawn without %s, which may change the image.", path, names)
-    return _with_third_axis(path, _with_filter(vertices))
-
-
-def _with_third_axis(path: str | Path, vertices: Vertices) -> Vertices:
-    """Return Gaussians with three axes: discs have none along their normal."""
+    vertices = _with_filter(vertices)
     if "scale_2" in vertices or not vertices.keys() >= {"scale_0", "scale_1", "opacity"}:
         return vertices
     _log.warning(
@@ -122,14 +118,9 @@ def _with_filter(vertices: Vertices) -> Vertices:
         wider = {name: np.logaddexp(size, np.log(squares)) for name, size in sizes.items()}
         ratio = np.exp(0.5 * sum(sizes[name] - wider[name] for name in sizes))
         columns = {name: 0.5 * size for name, size in wider.items()}
-        columns["opacity"] = _scaled_logit(vertices["opacity"].astype(np.float64), ratio)
+        opacity = ratio / (1 + np.exp(-vertices["opacity"].astype(np.float64)))
+        columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
     unfiltered = squares == 0
     return vertices | {
         name: np.where(unfiltered, vertices[name], values) for name, values in columns.items()
     }
-
-
-def _scaled_logit(logit: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Return the logit of an opacity multiplied by a factor."""
-    opacity = factor / (1 + np.exp(-logit))
-    return np.log(opacity) - np.log1p(-opacity)

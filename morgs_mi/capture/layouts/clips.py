@@ -236,18 +236,17 @@ class ImageSizes:
                 return None
             clip = self._clips[name]
         if clip not in self._sizes:
-            self._sizes[clip] = _clip_size(clip)
+            frames = clip
+            size = (0, 0)  # of an image, by its header if it shows it
+            if isinstance(clip, Path) and clip.suffix.lower() in (*IMAGE_SUFFIXES, EXR_SUFFIX):
+                if clip.stat().st_size:
+                    size = image_size(np.memmap(clip, np.uint8, "r"))
+                frames = (clip,)
+            if not all(size):
+                reader = open_frames(frames)
+                size = (reader.width, reader.height)
+            self._sizes[clip] = size
         return self._sizes[clip]
-
-
-def _clip_size(clip: Clip) -> tuple[int, int]:
-    """Return the width and height of a clip or an image, by its header if it shows them."""
-    if isinstance(clip, Path) and clip.suffix.lower() in (*IMAGE_SUFFIXES, EXR_SUFFIX):
-        if clip.stat().st_size and all(size := image_size(np.memmap(clip, np.uint8, "r"))):
-            return size
-        clip = (clip,)
-    reader = open_frames(clip)
-    return reader.width, reader.height
 
 
 def _folders(folder: Path) -> dict[str, Path]:

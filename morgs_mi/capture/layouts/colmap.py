@@ -11,7 +11,7 @@ and silently drops every second image of a text model without blank lines.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,18 +62,13 @@ class ColmapModel:
     point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
 
 
-def find_colmap(folder: Path) -> Path | None:
-    """Return the folder of the COLMAP model in a capture, or None.
+def find_models(folder: Path) -> list[Path]:
+    """Return the folders of the COLMAP models in a capture, of which the first is used.
 
-    It is in a numbered folder of `sparse`, in `sparse`, in another folder of it, likewise in
-    `colmap/sparse`, or in the capture itself. COLMAP writes several models, in any order, if it
-    cannot connect all images: the one of most images is used.
+    They are numbered folders of `sparse`, `sparse` itself, other folders of it, likewise of
+    `colmap/sparse`, or the capture itself. COLMAP writes several models, in any order, if it cannot
+    connect all images: the one of most images is the first.
     """
-    return next(iter(_models(folder)), None)
-
-
-def _models(folder: Path) -> list[Path]:
-    """Return the folders of the models of a capture, of which the first is used."""
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
         inner = [model for model in listed(place) if _holds_model(model)] if place.is_dir() else []
         if models := [model for model in inner if model.name.isdecimal()]:
@@ -112,49 +107,39 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     cameras_path, images_path = (folder / f"{name}.{kind}" for name in _FILES)
     for path in (cameras_path, images_path):
         existing_file(path, "a file of a COLMAP model", "export the whole model")
-    views = _views(images_path, _intrinsics(cameras_path))
-    cameras, lenses = zip(*views, strict=True)
-    paths = (folder / f"points3D.{suffix}" for suffix in (kind, "bin", "txt", "ply"))
-    points_path = next((path for path in paths if path.exists()), None)
-    points = (NO_POINTS, NO_POINTS) if points_path is None else _points(points_path)
-    return ColmapModel(cameras, lenses, *points)
-
-
-def _intrinsics(path: Path) -> dict[int, tuple[Lens, np.ndarray, int, int]]:
-    """Return the lens, K, width and height of the cameras of a model by their ids."""
+    is_binary = kind == "bin"
     intrinsics = {}
-    rows = (binary_cameras if path.suffix == ".bin" else text_cameras)(path)
-    for camera_id, model, width, height, params in rows:
-        with errors_at(f"{path}: camera {camera_id}"):
-            intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
-        check_claim(path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
-    return intrinsics
-
-
-def _views(
-    path: Path, intrinsics: Mapping[int, tuple[Lens, np.ndarray, int, int]]
-) -> list[tuple[Camera, Lens]]:
-    """Return the camera and the lens of each image of a model."""
-    views: list[tuple[Camera, Lens]] = []
-    for name, camera_id, pose in (binary_images if path.suffix == ".bin" else text_images)(path):
-        with errors_at(f"{path}, image {name!r}"):
+    for camera_id, model, *size, params in (binary_cameras if is_binary else text_cameras)(
+        cameras_path
+    ):
+        with errors_at(f"{cameras_path}: camera {camera_id}"):
+            intrinsics[camera_id] = (*lens_and_intrinsics(model, params), *size)
+        check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
+    cameras: list[Camera] = []
+    lenses: list[Lens] = []
+    rows = (binary_images if is_binary else text_images)(images_path)
+    for name, camera_id, pose in rows:
+        with errors_at(f"{images_path}, image {name!r}"):
             if camera_id not in intrinsics:
                 raise ValueError(f"it refers to camera {camera_id}, of {few(sorted(intrinsics))}")
             lens, K, width, height = intrinsics[camera_id]
-            views.append((Camera(K, _viewmat(pose), width, height, name), lens))
-        check_claim(path, _CAMERA_BYTES * len(views), f"{len(views)} images")
-    if not views:
-        raise ValueError(f"{path}: expected at least one image, got none; register the images.")
-    return views
-
-
-def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions and the colours of the points of a model [P, 3]."""
-    if path.suffix == ".ply":
-        return read_points_ply(path)
-    rows = (binary_points if path.suffix == ".bin" else text_points)(path)
-    xyz, rgb = np.hsplit(np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64), 2)
-    return xyz, (rgb / 255).astype(np.float32)
+            cameras.append(Camera(K, _viewmat(pose), width, height, name))
+            lenses.append(lens)
+        check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
+    if not cameras:
+        raise ValueError(f"{images_path}: expected at least one image, got none; register them.")
+    paths = (folder / f"points3D.{suffix}" for suffix in (kind, "bin", "txt", "ply"))
+    path = next((path for path in paths if path.exists()), None)
+    if path is None:
+        points = colors = NO_POINTS
+    elif path.suffix == ".ply":
+        points, colors = read_points_ply(path)
+    else:
+        rows = (binary_points if path.suffix == ".bin" else text_points)(path)
+        table = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
+        points, colors = np.hsplit(table, 2)
+        colors = (colors / 255).astype(np.float32)
+    return ColmapModel(tuple(cameras), tuple(lenses), points, colors)
 
 
 def write_colmap(
@@ -233,7 +218,7 @@ def _viewmat(pose: Sequence[float]) -> np.ndarray:
 
 def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
-    folder, *others = _models(path)
+    folder, *others = find_models(path)
     if others:
         counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
         _LOG.warning(
@@ -246,5 +231,5 @@ def _read_calibration(path: Path) -> Calibration:
 
 
 READER = Reader(
-    "COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path) is not None, _read_calibration
+    "COLMAP", ("sparse/0", "sparse"), lambda path: bool(find_models(path)), _read_calibration
 )

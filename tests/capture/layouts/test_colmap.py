@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.layouts.colmap import find_colmap, read_colmap, write_colmap
+from morgs_mi.capture.layouts.colmap import find_models, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
@@ -224,7 +224,7 @@ def test_read_colmap__reads_aligned_columns(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["txt", "bin"])
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
-def test_find_colmap__takes_the_model_of_most_images(
+def test_find_models__takes_the_model_of_most_images(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str, place: str
 ) -> None:
     names = ("cam1", "cam2", "cam3")
@@ -242,12 +242,12 @@ def test_find_colmap__takes_the_model_of_most_images(
     )
 
 
-def test_find_colmap__takes_the_first_of_equal_models_and_the_only_one(tmp_path: Path) -> None:
+def test_find_models__takes_the_first_of_equal_models_and_the_only_one(tmp_path: Path) -> None:
     for number in ("1", "2"):
         write_colmap(tmp_path / "sparse" / number, rig(("cam1", "cam2")))
-    assert find_colmap(tmp_path) == tmp_path / "sparse" / "1"
+    assert find_models(tmp_path)[0] == tmp_path / "sparse" / "1"
     (tmp_path / "sparse/1/images.txt").write_text("broken\n")
-    assert find_colmap(tmp_path) == tmp_path / "sparse" / "2"
+    assert find_models(tmp_path)[0] == tmp_path / "sparse" / "2"
     write_colmap(tmp_path / "a/sparse", rig(("cam1",)))
     write_colmap(tmp_path / "a/sparse/backup", rig(("cam1", "cam2")))
-    assert find_colmap(tmp_path / "a") == tmp_path / "a/sparse"
+    assert find_models(tmp_path / "a")[0] == tmp_path / "a/sparse"
