@@ -483,8 +483,8 @@ def _downscaled_cameras(
         largest = _shortest_side(recorded) / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
         raise ValueError(
-            f"load_capture(): `downscale` must leave at least {MIN_SIDE} pixels on each side, got "
-            f"{downscale:g}; {remedy}."
+            f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
+            f"side, got {downscale:g}; {remedy}."
         )
     return cameras
 

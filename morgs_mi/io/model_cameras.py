@@ -44,7 +44,7 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
         cameras = []
         for i in range(0, len(rows), -(-len(rows) // _MOST)):
             row = rows[i]
-            with errors_at(f"{file}: entry {i}"):
+            with errors_at(f"{file}: entry {i}: expected a camera, got a broken one"):
                 R = np.asarray(row["rotation"], np.float64)
                 viewmat = np.eye(4)
                 viewmat[:3, :3] = R.T

@@ -207,7 +207,7 @@ def test_load_capture__refuses_broken_settings(tmp_path: Path, settings: str, me
     [
         (
             {"downscale": 2},
-            r"`downscale` must leave at least 32 pixels on each side, got 2; use at most 1.43",
+            r"`downscale` must leave images of at least 32 pixels .*, got 2; use at most 1.43",
         ),
         ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
         ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
