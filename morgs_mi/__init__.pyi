@@ -8,6 +8,7 @@ from .core.color_space import SH_C0
 from .core.gaussians import Gaussians
 from .core.progress import ProgressBar
 from .core.rig import with_near_planes
+from .evaluate.accuracy import accuracy
 from .evaluate.evaluate import evaluate_stream
 from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
@@ -49,6 +50,7 @@ __all__ = [
     "StreamConfig",
     "StreamLoop",
     "SynthConfig",
+    "accuracy",
     "channel_image",
     "confidence_image",
     "depth_image",

@@ -1,7 +1,7 @@
 """Command line, the package's only argument parser.
 
 `morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`,
-`sweep` and `demo`.
+`accuracy`, `sweep` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the
 user can correct is one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status
@@ -33,6 +33,7 @@ from morgs_mi.cli.console import (
     print_warning,
     sentence_of,
 )
+from morgs_mi.cli.accuracy import Accuracy
 from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
 from morgs_mi.cli.fit import Fit
@@ -56,6 +57,7 @@ COMMANDS: Mapping[str, type] = {
     "import": studio_entry("commands", "import"),
     "view": View,
     "eval": Eval,
+    "accuracy": Accuracy,
     "sweep": studio_entry("commands", "sweep"),
     "demo": studio_entry("commands", "demo"),
 }

@@ -16,14 +16,14 @@ from annotated_types import Ge
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.config import check_value
 from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import atomic_path, write_json
+from morgs_mi.core.files import write_json
+from morgs_mi.core.plots import check_plot, save_plot
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.studio.calibration.checks.plots import check_plot
 
 Scores = Mapping[str, float]
 
@@ -131,6 +131,4 @@ def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
             axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
         axes.set(xlabel="seconds of a later frame", ylabel=SCORES[name][0])
         axes.grid(color="0.9")
-    with atomic_path(path, "write_sweep_plot()") as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(partial, format=path.suffix[1:].lower())
+    save_plot(path, figure, "write_sweep_plot()")

@@ -17,8 +17,9 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.points import match_capture, triangulate_points
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
+from morgs_mi.core.plots import check_plot
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.studio.calibration.checks.plots import check_plot, write_rig
+from morgs_mi.studio.calibration.checks.plots import write_rig
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.studio.calibration.timing import TimeOffsets, estimate_time_offsets
 

@@ -41,8 +41,8 @@ class Sweep:
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
+        from morgs_mi.core.plots import check_plot
         from morgs_mi.evaluate.tables import figure
-        from morgs_mi.studio.calibration.checks.plots import check_plot
         from morgs_mi.studio.sweep import SCORES, mean_scores, sweep, write_sweep_plot
 
         if self.plot is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,12 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.files import atomic_path
+from morgs_mi.core.plots import check_plot, save_plot
 from morgs_mi.core.rig import up_direction
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 # Inches.
 _WIDTH = 14.4
 _HEIGHT = 7.6
-# Dots per inch.
-_DPI = 100
 # Colour of a camera, and of a held-out one.
 _USUAL = "tab:blue"
 _MARKED = "tab:red"
@@ -29,26 +25,6 @@ _AXIS_COLORS = ("indianred", "seagreen", "royalblue")
 _MAX_POINTS = 20_000
 # The edges of a frustum as one line through its centre 0 and its corners 1 to 4.
 _EDGES = [0, 1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
-
-
-def check_plot(path: Path) -> None:
-    """Check that a plot can be written.
-
-    Raises:
-        ValueError: the name has another suffix, or matplotlib is not installed.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise ValueError(
-            f"{path}: the suffix of a plot must be .png, .jpg, .svg or .pdf, got {suffix!r}; "
-            "rename it."
-        )
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise ValueError(
-            f"{path}: a plot needs the package matplotlib; pip install 'morgs-mi[plots]'."
-        ) from None
 
 
 def write_rig(path: Path, capture: Capture) -> None:
@@ -66,17 +42,13 @@ def write_rig(path: Path, capture: Capture) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    data = BytesIO()
     # Names may contain dollars, and letters that the font lacks and draws as boxes.
     with rc_context({"text.parse_math": False}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
         points = (capture.points, capture.point_colors)
         draw_rig(figure, capture.cameras, points, capture.test_views)
-        figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
-    with atomic_path(path, "write_rig()") as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data.getvalue())
+        save_plot(path, figure, "write_rig()")
 
 
 def draw_rig(

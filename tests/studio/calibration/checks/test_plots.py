@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
-from morgs_mi.studio.calibration.checks.plots import check_plot, draw_rig, write_rig
+from morgs_mi.core.plots import check_plot
+from morgs_mi.studio.calibration.checks.plots import draw_rig, write_rig
 from tests.assertions import assert_close
 from tests.scenes.cameras import circle, look_at_cameras
 

@@ -1,0 +1,57 @@
+"""`morgs-mi accuracy`: error against run time of the renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import DisallowNone, Positional
+
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.cli.console import print_result, print_table, progress
+from morgs_mi.cli.opening import DropInvalid, opened
+from morgs_mi.cli.settings import optional, place
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Compare the renderer with a float64 reference, for a file of Gaussians or the first frame of
+    a stream: error against run time along its settings.
+    """
+
+    out: Positional[Path]
+    """File of Gaussians, .ply, .compressed.ply or .splat, folder of a fit, or a stream file."""
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.png")] = None
+    """Plot, beside which a .json has all results; by default OUT/NAME-accuracy.png. Needs the extra
+    plots.
+    """
+    camera: Annotated[str | None, DisallowNone, optional("CAMERA")] = None
+    """Camera by index or name; by default the first one, for a file of Gaussians the one with most
+    detail in view.
+    """
+    tolerance: float = 1e-3
+    """Largest relative error of the image and of each gradient, for the choice of the fastest
+    settings.
+    """
+    drop_invalid: DropInvalid = False
+
+    def run(self) -> None:
+        from morgs_mi.core.files import write_json
+        from morgs_mi.core.plots import check_plot
+        from morgs_mi.evaluate.accuracy import accuracy
+        from morgs_mi.playback.stream_header import find_camera
+
+        stream = opened(self.out, self.drop_invalid)
+        view = find_camera(stream, self.camera or 0)
+        beside = stream.path.with_name(f"{stream.path.stem}-accuracy.png")
+        plot = check_output(self.output or beside)
+        check_plot(plot)
+        gaussians = next(stream.states()).gaussians
+        with progress() as report:
+            result = accuracy(gaussians, view, tolerance=self.tolerance, progress=report)
+        print_table(result.table())
+        result.plot(plot)
+        write_json(plot.with_suffix(".json"), result.as_dict())
+        print_result(f"Plot: {plot}")
+        print_result(f"All results: {plot.with_suffix('.json')}")

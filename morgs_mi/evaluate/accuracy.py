@@ -1,0 +1,195 @@
+"""Error against run time of the renderer's settings, for Gaussians and a camera of one's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from io import StringIO
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.environment import machine, versions
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.plots import check_plot, save_plot
+from morgs_mi.core.progress import Progress, Report
+from morgs_mi.evaluate.reference64 import ATTRIBUTES, reference64
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
+
+# For 100,000 Gaussians the reference then takes 5 s on two cores.
+_PIXELS = 512
+ROUNDS = 5
+CHANGES = {
+    f"1/{levels}, {stop:g}": {"alpha_min": 1 / levels, "stop_transmittance": stop}
+    for levels in (255, 4080, 65280)
+    for stop in (1e-2, 1e-4, 1e-6)
+} | {
+    "block 4x4": {"block_width": 4, "block_height": 4},
+    "block 8x8": {"block_width": 8, "block_height": 8},
+    "reproducible": {"reproducible": True},
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Run time and errors of one configuration."""
+
+    name: str  #: Its `alpha_min` and `stop_transmittance`, or another setting.
+    config: RenderConfig
+    seconds: float  #: Median time of an image and its gradients.
+    errors: Mapping[str, float]  #: Of the image, and of the gradient by attribute.
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors and run times of the renderer's settings, which a notebook shows (see `accuracy`)."""
+
+    rows: tuple[Setting, ...]
+    tolerance: float  #: Largest error of the image and of every gradient.
+    config: RenderConfig | None  #: The fastest one within the tolerance; None if there is none.
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as JSON can hold it, with machine and versions."""
+        return {**asdict(self), "machine": machine(), "versions": versions()}
+
+    def table(self) -> Table:
+        """Return a table of at most 80 columns; a star marks `config`."""
+        names = (name.split("_")[-1] for name in self.rows[0].errors)
+        title = f"relative errors; *: fastest within {self.tolerance:g}"
+        columns = ("alpha_min, stop", "ms", *names)
+        table = Table(*columns, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
+        for row in self.rows:
+            name = row.name + " *" * (row.config == self.config)
+            errors = (f"{error:.0e}" for error in row.errors.values())
+            table.add_row(name, f"{1e3 * row.seconds:.1f}", *errors)
+        return table
+
+    def plot(self, path: str | Path) -> None:
+        """Plot the errors over run time into a .png, .jpg, .svg or .pdf file.
+
+        Raises:
+            ValueError: the suffix is another one, or matplotlib is not installed.
+            OSError: the file cannot be written.
+        """
+        check_plot(Path(path))
+        save_plot(Path(path), self._figure(), "Accuracy.plot()")
+
+    def _repr_html_(self) -> str:
+        plot = StringIO()
+        with suppress(ImportError):
+            self._figure().savefig(plot, format="svg")
+        return self.table()._repr_mimebundle_((), ())["text/html"] + plot.getvalue()
+
+    def _figure(self) -> Any:
+        from matplotlib.figure import Figure
+        from matplotlib.style import context
+
+        with context("tableau-colorblind10"):
+            figure = Figure((10, 4), layout="constrained")
+            panels = figure.subplots(1, 2)
+            for name, rows in groupby(self.rows, lambda row: row.name.split(",")[0]):
+                points = [(row.seconds, *row.errors.values()) for row in rows]
+                seconds, image, *gradients = np.transpose(points)
+                errors = image, np.max(gradients, axis=0)
+                for axes, error in zip(panels, errors, strict=True):
+                    axes.plot(seconds, error, "o-", label=name)
+                    axes.axhline(self.tolerance, color="0.8", linestyle=":")
+        for axes, title in zip(panels, ("image", "worst gradient"), strict=True):
+            axes.set(xlabel="s", ylabel="relative error", yscale="log", title=title)
+        panels[1].legend(title="alpha_min", loc="upper left", bbox_to_anchor=(1, 1))
+        figure.suptitle("stop_transmittance 1e-2, 1e-4 and 1e-6 along each line")
+        return figure
+
+
+def accuracy(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RenderConfig | None = None,
+    tolerance: float = 1e-3,
+    progress: Report | None = None,
+) -> Accuracy:
+    """Measure error and run time of the renderer along the settings that trade one for the other.
+
+    `alpha_min`, `stop_transmittance`, the shape of the blocks and `reproducible` vary; Gaussians
+    are sorted exactly with all of them. Errors are relative L2 norms of the colours of 512 random
+    pixels and of gradients, against a float64 reference without both cut-offs. The loss has random
+    weights at these pixels and zero weights elsewhere, so that the renderer runs unchanged. Where
+    the gradient of scales, rotations or opacities almost vanishes, its error is relative to a
+    hundredth of the largest of the three.
+
+    Args:
+        gaussians: N Gaussians; their motion is ignored, as are the delays of the camera.
+        camera: the view.
+        config: values of the settings that do not vary; default is `RenderConfig()`.
+        tolerance: largest error of `Accuracy.config`.
+        progress: called with (stage, done, total).
+
+    Example:
+        >>> result = morgs_mi.accuracy(gaussians, camera, tolerance=1e-3)
+        >>> image = morgs_mi.rasterize(gaussians, camera, config=result.config)
+
+    Raises:
+        ValueError: as `rasterize`.
+    """
+    config = config or RenderConfig()
+    camera = replace(camera, delay=0, readout=0)
+    gaussians = Gaussians(**gaussians.numpy())
+    tensors = [getattr(gaussians, name) for name in ATTRIBUTES]
+    dr.enable_grad(tensors)
+    rng = np.random.default_rng(0)
+    shape = camera.height, camera.width
+    mask = rng.permutation(camera.height * camera.width).reshape(shape) < _PIXELS
+    rows, columns = np.nonzero(mask)
+    weights = rng.normal(size=(*shape, 3)) * mask[..., None]
+    weights32 = mi.TensorXf(weights.astype(np.float32))
+    # An alpha below 1e-12 changes no float32 image.
+    colors, gradients = reference64(
+        gaussians,
+        camera,
+        np.stack([columns, rows], axis=1),
+        weights[mask],
+        replace(config, alpha_min=1e-12),
+    )
+    expected = [colors, *gradients.values()]
+    scales = np.array([*map(np.linalg.norm, expected)]) + 1e-30
+    scales[2:5] = scales[2:5].clip(0.01 * scales[2:5].max())
+
+    configs = [replace(config, **change) for change in CHANGES.values()]
+    stage = Progress(progress, "Measuring settings")
+    steps = []
+    for done, setting in enumerate(configs * (1 + ROUNDS)):  # the first one compiles
+        stage(done, len(configs) * (1 + ROUNDS))
+        dr.sync_thread()
+        start = time.perf_counter()
+        image = rasterize(gaussians, camera, ("color",), config=setting).color
+        dr.backward(dr.sum(image * weights32, axis=None))
+        result = dr.grad(tensors)
+        dr.eval(result)
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        dr.clear_grad(tensors)
+        results = [np.array(image)[mask], *result]
+        steps.append((seconds, *map(np.linalg.norm, map(np.subtract, results, expected))))
+    table = np.reshape(steps, (1 + ROUNDS, len(configs), -1))
+    errors = table[0, :, 1:] / scales
+    # Other programs slow down all settings of a round.
+    pace = table[1:, :, 0].mean(axis=1, keepdims=True)
+    medians = np.median(table[1:, :, 0] / pace, axis=0) * np.median(pace)
+    names = "image", *ATTRIBUTES
+    settings = tuple(
+        Setting(name, setting, float(median), dict(zip(names, row.tolist(), strict=True)))
+        for name, setting, median, row in zip(CHANGES, configs, medians, errors, strict=True)
+    )
+    precise = [row for row in settings if max(row.errors.values()) <= tolerance]
+    fastest = min(precise, key=lambda row: row.seconds).config if precise else None
+    return Accuracy(settings, tolerance, fastest)

@@ -1,0 +1,41 @@
+"""`morgs-mi accuracy`: table, plot and JSON of a file of Gaussians and of a stream."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from benchmarks.workloads import ball
+from morgs_mi import write_ply
+from morgs_mi.evaluate import accuracy as module
+from tests.cli.commands import assert_refused
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    names = ("1/255, 0.01", "1/65280, 1e-06")
+    monkeypatch.setattr(module, "CHANGES", {name: module.CHANGES[name] for name in names})
+    monkeypatch.setattr(module, "ROUNDS", 2)
+    write_ply(tmp_path / "scene.ply", ball(0, 300, 40, 24, 0.1, 1)[0])
+    return tmp_path / "scene.ply"
+
+
+def test_accuracy__writes_plot_and_json_beside_the_file(run, scene):
+    status, text, _ = run("accuracy", scene)
+    assert status == 0
+    assert "1/65280, 1e-06 *" in text
+    assert scene.with_name("scene-accuracy.png").read_bytes().startswith(b"\x89PNG")
+    result = json.loads(scene.with_name("scene-accuracy.json").read_text())
+    assert result["config"]["alpha_min"] == 1 / 65280
+
+
+def test_accuracy__takes_camera_tolerance_and_output(run, scene, tmp_path):
+    status, _, _ = run(
+        "accuracy", scene, tmp_path / "a.svg", "--camera", "left", "--tolerance", "1e-8"
+    )
+    assert status == 0
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert json.loads((tmp_path / "a.json").read_text())["config"] is None
+    assert_refused(run("accuracy", scene, tmp_path / "a.txt"), "suffix of a plot")
+    assert_refused(run("accuracy", scene, "--camera", "roof"), "front-right", "got 'roof'")
