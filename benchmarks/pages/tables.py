@@ -146,10 +146,7 @@ def fuzz() -> str:
 
 def accuracy() -> str:
     """Return time and errors of the cut-offs of the renderer."""
-    knobs = "alpha_min", "stop_transmittance"
-    return renderer.errors_table(
-        [row for row in committed("renderer_report")["rows"] if row["knob"] in knobs]
-    )
+    return renderer.errors_table(committed("renderer_report")["rows"])
 
 
 def steps() -> str:

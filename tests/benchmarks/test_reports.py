@@ -12,7 +12,6 @@ import pytest
 import tyro
 
 from benchmarks.reports import cameras, random_scenes, timing
-from benchmarks.reports.reference64 import ATTRIBUTES, Reference64
 from benchmarks.reports.study import Scene
 from benchmarks.reports.tracks import track_scores
 from morgs_mi import RenderConfig, SynthConfig, load_capture, synthesize
@@ -21,10 +20,7 @@ from morgs_mi.codec.frame_source import FrameState
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.runs.fit_capture import stream_capture
-from tests import reference
 from tests.quick import quick
-from tests.scenes.cameras import make_camera
-from tests.scenes.gaussians import make_scene
 from tests.scenes.moving_splats import moved
 
 SEED = "--seeds 1 --clips CLIPS"
@@ -90,22 +86,3 @@ def test_track_scores__of_gaussians_at_rest_beside_moving_points(fitted_clip, tm
     assert scores["average_jaccard"] == pytest.approx(1 / 15)
     assert scores["delta_avg"] == pytest.approx(1 / 10)
     assert scores["median_error"] == pytest.approx(0.15)
-
-
-def test_reference64__agrees_with_the_reference_of_the_tests():
-    raw = make_scene(3, 6, logits=(-1.5, 7))  # some pixels reach the cap of alpha
-    raw["means"][0] = (0, 0, -9)  # behind the camera
-    camera = make_camera(13, 9)
-    pixels = np.argwhere(np.ones((9, 13)))[:, ::-1]
-    weight = np.random.default_rng(3).normal(size=(len(pixels), 4))
-
-    def values(raw):
-        image = reference.rasterize_view(raw, camera, viewmat=camera.viewmat)
-        return np.concatenate([image["color"], image["alpha"]], axis=2).reshape(-1, 4)
-
-    ours = Reference64(raw, camera, RenderConfig())
-    assert np.abs(ours.render(pixels) - values(raw)).max() < 1e-13
-    names = list(ATTRIBUTES)
-    expected = reference.complex_step(lambda raw: np.sum(values(raw) * weight), raw, names)
-    for name, gradient in ours.gradients(pixels, weight).items():
-        assert np.abs(gradient - expected[name]).max() < 1e-11 * np.abs(expected[name]).max(), name
