@@ -66,8 +66,9 @@ class Accuracy:
         """Return a table of at most 80 columns; a star marks `config`."""
         names = (name.split("_")[-1] for name in self.rows[0].errors)
         title = f"relative errors; *: fastest within {self.tolerance:g}"
-        columns = ("alpha_min, stop", "ms", *names)
-        table = Table(*columns, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
+        table = Table(
+            "alpha_min, stop", "ms", *names, box=SIMPLE_HEAD, title=title, padding=(0, 1, 0, 0)
+        )
         for row in self.rows:
             name = row.name + " *" * (row.config == self.config)
             errors = (f"{error:.0e}" for error in row.errors.values())
@@ -94,19 +95,19 @@ class Accuracy:
         from matplotlib.figure import Figure
         from matplotlib.style import context
 
+        figure = Figure((10, 4), layout="constrained")
         with context("tableau-colorblind10"):
-            figure = Figure((10, 4), layout="constrained")
             panels = figure.subplots(1, 2)
-            for name, rows in groupby(self.rows, lambda row: row.name.split(",")[0]):
-                points = [(row.seconds, *row.errors.values()) for row in rows]
-                seconds, image, *gradients = np.transpose(points)
-                errors = image, np.max(gradients, axis=0)
-                for axes, error in zip(panels, errors, strict=True):
-                    axes.plot(seconds, error, "o-", label=name)
-                    axes.axhline(self.tolerance, color="0.8", linestyle=":")
+        for name, rows in groupby(self.rows, lambda row: row.name.split(",")[0]):
+            seconds, image, *gradients = np.transpose(
+                [(row.seconds, *row.errors.values()) for row in rows]
+            )
+            panels[0].plot(seconds, image, "o-", label=name)
+            panels[1].plot(seconds, np.max(gradients, axis=0), "o-")
         for axes, title in zip(panels, ("image", "worst gradient"), strict=True):
+            axes.axhline(self.tolerance, color="0.8", linestyle=":")
             axes.set(xlabel="s", ylabel="relative error", yscale="log", title=title)
-        panels[1].legend(title="alpha_min", loc="upper left", bbox_to_anchor=(1, 1))
+        figure.legend(title="alpha_min", loc="outside right upper")
         figure.suptitle("stop_transmittance 1e-2, 1e-4 and 1e-6 along each line")
         return figure
 
@@ -149,47 +150,40 @@ def accuracy(
     rng = np.random.default_rng(0)
     shape = camera.height, camera.width
     mask = rng.permutation(camera.height * camera.width).reshape(shape) < _PIXELS
-    rows, columns = np.nonzero(mask)
     weights = rng.normal(size=(*shape, 3)) * mask[..., None]
     weights32 = mi.TensorXf(weights.astype(np.float32))
     # An alpha below 1e-12 changes no float32 image.
-    colors, gradients = reference64(
-        gaussians,
-        camera,
-        np.stack([columns, rows], axis=1),
-        weights[mask],
-        replace(config, alpha_min=1e-12),
-    )
-    expected = [colors, *gradients.values()]
-    scales = np.array([*map(np.linalg.norm, expected)]) + 1e-30
+    exact = replace(config, alpha_min=1e-12)
+    pixels = np.argwhere(mask)[:, ::-1]
+    colors, gradients = reference64(gaussians, camera, pixels, weights[mask], exact)
+    expected = {"image": colors, **gradients}
+    scales = np.array([*map(np.linalg.norm, expected.values())]) + 1e-30
     scales[2:5] = scales[2:5].clip(0.01 * scales[2:5].max())
 
-    configs = [replace(config, **change) for change in CHANGES.values()]
     stage = Progress(progress, "Measuring settings")
-    steps = []
-    for done, setting in enumerate(configs * (1 + ROUNDS)):  # the first one compiles
-        stage(done, len(configs) * (1 + ROUNDS))
-        dr.sync_thread()
-        start = time.perf_counter()
-        image = rasterize(gaussians, camera, ("color",), config=setting).color
-        dr.backward(dr.sum(image * weights32, axis=None))
-        result = dr.grad(tensors)
-        dr.eval(result)
-        dr.sync_thread()
-        seconds = time.perf_counter() - start
-        dr.clear_grad(tensors)
-        results = [np.array(image)[mask], *result]
-        steps.append((seconds, *map(np.linalg.norm, map(np.subtract, results, expected))))
-    table = np.reshape(steps, (1 + ROUNDS, len(configs), -1))
-    errors = table[0, :, 1:] / scales
-    # Other programs slow down all settings of a round.
-    pace = table[1:, :, 0].mean(axis=1, keepdims=True)
-    medians = np.median(table[1:, :, 0] / pace, axis=0) * np.median(pace)
-    names = "image", *ATTRIBUTES
-    settings = tuple(
-        Setting(name, setting, float(median), dict(zip(names, row.tolist(), strict=True)))
-        for name, setting, median, row in zip(CHANGES, configs, medians, errors, strict=True)
-    )
-    precise = [row for row in settings if max(row.errors.values()) <= tolerance]
+    rows: list[Setting] = []
+    for name, change in CHANGES.items():
+        stage(len(rows), len(CHANGES))
+        setting = replace(config, **change)
+        times = []
+        results: list[Any] = []
+        for _ in range(1 + ROUNDS):  # the first one compiles
+            dr.sync_thread()
+            start = time.perf_counter()
+            image = rasterize(gaussians, camera, ("color",), config=setting).color
+            dr.backward(dr.sum(image * weights32, axis=None))
+            results = dr.grad(tensors)
+            dr.eval(results)
+            dr.sync_thread()
+            times.append(time.perf_counter() - start)
+            dr.clear_grad(tensors)
+            results = [np.array(image)[mask], *results]
+        errors = {
+            key: float(np.linalg.norm(result - value) / scale)
+            for (key, value), result, scale in zip(expected.items(), results, scales, strict=True)
+        }
+        rows.append(Setting(name, setting, float(np.median(times[1:])), errors))
+    stage(len(rows), len(CHANGES))
+    precise = [row for row in rows if max(row.errors.values()) <= tolerance]
     fastest = min(precise, key=lambda row: row.seconds).config if precise else None
-    return Accuracy(settings, tolerance, fastest)
+    return Accuracy(tuple(rows), tolerance, fastest)
