@@ -15,6 +15,7 @@ from benchmarks.reports import (
     held_out,
     random_scenes,
     renderer,
+    stability,
     timing,
 )
 from benchmarks.reports.method_tables import best_rows
@@ -178,6 +179,8 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
+    "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
+    "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "splat_files": splat_files,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),

@@ -17,6 +17,7 @@ import numpy as np
 from morgs_mi import Camera, RenderConfig, rasterize
 from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
+from tests.scenes.extremes import Case
 from tests.scenes.gaussians import CHANNELS, Values
 
 SIZES = {"color": 3, "motion": 2}
@@ -161,3 +162,37 @@ def run(
             f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
         )
     return channels, grads
+
+
+def errors(case: Case) -> dict[str, float]:
+    """Return the errors of the image and of each attribute's gradient against the reference."""
+    values = case.values
+    camera = case.camera
+    expected = exact_image(values, camera)
+    weight = weights(expected, clear_pixels(values, camera))
+    image, grads = run(values, camera, weight)
+    result = {"image": 0.0}
+    for name in CHANNELS:
+        error = np.abs(image[name] - expected[name])[weight[name] != 0] / max(
+            1.0, np.abs(expected[name]).max()
+        )
+        result["image"] = max(result["image"], float(error.max(initial=0)))
+    # Per relative change, as for an optimiser of logarithms.
+    unit = {"scales": values["scales"], "opacities": values["opacities"]}
+    unit["quats"] = np.linalg.norm(values["quats"], axis=1, keepdims=True)
+    if case.every_entry:
+        exact = {n: g * unit.get(n, 1) for n, g in exact_gradients(values, camera, weight).items()}
+        grads = {n: g * unit.get(n, 1) for n, g in grads.items()}
+    else:
+        along = {n: np.sign(g) for n, g in grads.items()}
+        exact = {
+            n: exact_slope(values, camera, weight, n, v * unit.get(n, 1)) for n, v in along.items()
+        }
+        grads = {n: np.abs(g * unit.get(n, 1)).sum() for n, g in grads.items()}
+    # These three are sums of the same terms: one that almost vanishes is compared relative to the
+    # largest.
+    floor = 0.01 * max(np.abs(exact[name]).max() for name in unit)
+    for name in ATTRIBUTES:
+        scale = max(np.abs(exact[name]).max(), floor if name in unit else 0, 1e-30)
+        result[name] = float(np.abs(grads[name] - exact[name]).max() / scale)
+    return result

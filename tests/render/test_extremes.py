@@ -7,14 +7,12 @@ and opacities are per relative change, as for an optimiser of logarithms.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi import Camera, rasterize
 from tests import tolerances as tol
 from tests.render.exact import (
     ATTRIBUTES,
@@ -22,48 +20,13 @@ from tests.render.exact import (
     CONFIG,
     Activated,
     clear_pixels,
-    exact_gradients,
+    errors,
     exact_image,
-    exact_slope,
     run,
     weights,
 )
-from tests.scenes.extremes import CASES, Case, cloud, eye, random_case
+from tests.scenes.extremes import CASES, REFUSED, Case, eye, random_case, raw_gaussians
 from tests.scenes.gaussians import CHANNELS
-
-
-def errors(case: Case) -> dict[str, float]:
-    """Return the errors of the image and of each attribute's gradient against the reference."""
-    values = case.values
-    camera = case.camera
-    expected = exact_image(values, camera)
-    weight = weights(expected, clear_pixels(values, camera))
-    image, grads = run(values, camera, weight)
-    result = {"image": 0.0}
-    for name in CHANNELS:
-        error = np.abs(image[name] - expected[name])[weight[name] != 0] / max(
-            1.0, np.abs(expected[name]).max()
-        )
-        result["image"] = max(result["image"], float(error.max(initial=0)))
-    # Per relative change, as for an optimiser of logarithms.
-    unit = {"scales": values["scales"], "opacities": values["opacities"]}
-    unit["quats"] = np.linalg.norm(values["quats"], axis=1, keepdims=True)
-    if case.every_entry:
-        exact = {n: g * unit.get(n, 1) for n, g in exact_gradients(values, camera, weight).items()}
-        grads = {n: g * unit.get(n, 1) for n, g in grads.items()}
-    else:
-        along = {n: np.sign(g) for n, g in grads.items()}
-        exact = {
-            n: exact_slope(values, camera, weight, n, v * unit.get(n, 1)) for n, v in along.items()
-        }
-        grads = {n: np.abs(g * unit.get(n, 1)).sum() for n, g in grads.items()}
-    # These three are sums of the same terms: one that almost vanishes is compared relative to the
-    # largest.
-    floor = 0.01 * max(np.abs(exact[name]).max() for name in unit)
-    for name in ATTRIBUTES:
-        scale = max(np.abs(exact[name]).max(), floor if name in unit else 0, 1e-30)
-        result[name] = float(np.abs(grads[name] - exact[name]).max() / scale)
-    return result
 
 
 def failures(case: Case) -> list[str]:
@@ -144,19 +107,6 @@ def test_rasterize__gradients_of_the_pose_at_the_extremes():
     assert not failed, "\n".join(failed)
 
 
-def raw_gaussians(**change: Any) -> Gaussians:
-    values = cloud()
-    raw = {name: values[name] for name in ("means", "quats", "sh_coeffs", "motion")}
-    raw |= {
-        "log_scales": np.log(values["scales"]),
-        "logit_opacities": np.zeros(6),
-        "logit_confidence": np.zeros(6),
-    }
-    gaussians = Gaussians(**(raw | change))
-    dr.enable_grad(*gaussians.items().values())
-    return gaussians
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -190,45 +140,7 @@ def test_rasterize__raw_extremes_stay_finite(change):
         assert np.isfinite(np.asarray(dr.grad(value))).all(), name
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"log_scales": np.full((6, 3), 100.0)}, r"`scales` must be finite, got inf at \[0, 0\]"),
-        (
-            {"means": np.full((6, 3), [0, 0, -np.inf])},
-            r"`means` must be finite, got -inf at \[0, 2\]",
-        ),
-        (
-            {"means": np.full((6, 3), [0, 0, -10.0]), "quats": np.full((6, 4), np.nan)},
-            "`quats` must be finite",
-        ),
-        (
-            {"quats": np.full((6, 4), [0, 0, 0, np.nan])},
-            r"`quats` must be finite, got nan at \[0, 3\]",
-        ),
-        (
-            {"sh_coeffs": np.full((6, 4, 3), 3e38)},
-            r"`sh_coeffs` must be at most 1e18, got 3e\+38 at \[0, 0, 0\] \(72 ",
-        ),
-        (
-            {"sh_coeffs": np.full((6, 4, 3), -1e20)},
-            r"`sh_coeffs` must be at most 1e18, got -1e\+20",
-        ),
-        (
-            {"motion": np.full((6, 3), 1e30)},
-            r"`motion` must be at most 1e18, got 1e\+30 at \[0, 0\]",
-        ),
-    ],
-    ids=[
-        "overflow",
-        "infinite mean",
-        "behind",
-        "one component",
-        "colours",
-        "negative colours",
-        "motion",
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), REFUSED.values(), ids=REFUSED)
 def test_rasterize__refuses_non_finite_attributes_anywhere(change, message):
     with pytest.raises(ValueError, match=message):
         rasterize(raw_gaussians(**change), eye(), CHANNELS, BACKGROUND, config=CONFIG)

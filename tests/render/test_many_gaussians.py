@@ -16,26 +16,15 @@ from tests.render.exact import (
     exact_image,
     run,
 )
-from tests.scenes.extremes import cloud, eye
-from tests.scenes.gaussians import CHANNELS, Values
-
-
-def stack(n: int, opacity: float) -> Values:
-    """Return n Gaussians of various colours behind each other, for a camera at the origin."""
-    values = cloud(n)
-    values |= {
-        "means": np.c_[np.zeros((n, 2)), np.linspace(1, 2, n)],
-        "opacities": np.full(n, opacity),
-    }
-    values["sh_coeffs"] = np.clip(values["sh_coeffs"], -0.4, 0.4)
-    return {name: np.float32(value).astype(np.float64) for name, value in values.items()}
+from tests.scenes.extremes import ONE_PIXEL, cloud, eye, million_on_a_pixel, stack
+from tests.scenes.gaussians import CHANNELS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("opacity", [1.0, 0.99, 0.02])
 def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
     values = stack(10_000, opacity)
-    camera = Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
+    camera = ONE_PIXEL
     expected = exact_image(values, camera)
     for config in (CONFIG, RenderConfig()):
         image, grads = run(values, camera, config=config)
@@ -47,6 +36,14 @@ def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
             assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, (
                 "occluded Gaussians have no gradient"
             )
+
+
+@pytest.mark.slow
+def test_rasterize__blends_a_million_gaussians_on_one_pixel():
+    errors = million_on_a_pixel()
+    assert errors["image"] < tol.IMAGE_ABS
+    # Behind thousands of layers, gradients are rounding errors of the sum of all.
+    assert max(errors.values()) < tol.FUZZ_GRADIENT_REL, errors
 
 
 def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():

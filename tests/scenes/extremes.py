@@ -8,9 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
-from morgs_mi import Camera
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.evaluate.reference64 import reference64
 from tests import tolerances as tol
 from tests.scenes.gaussians import Values
 
@@ -122,87 +124,242 @@ FAR = np.array([1e5, -1e5, 1e5])
 LIFT = np.eye(4)
 LIFT[:3, 3] = -FAR
 BLOCKS = np.stack(np.meshgrid(np.arange(8) * 8 + 4.0, np.arange(8) * 4 + 2.0), -1).reshape(-1, 2)
+# From behind the camera, from its near plane on, and from beyond the point where they are.
+THROUGH = [[0, 0, 9], [0.1, 0, 3.5], [0, 0.2, 2.999], [0, 0, -40], [1, 1, 3e3], [0, 0, 0]]
 SLOW_REFERENCE = {"every_entry": False}
+# Beyond what float32 can hold: bounds of the errors that are reached.
+BEYOND = {"image": 2.0, "gradient": 10.0}
+# By the ratio of the largest to the smallest scale. The last ones are 2.5e6 px long and 0.5 px wide
+# on the screen, which is more than the aspect of 1e6 that is drawn.
+NEEDLES = {
+    10.0**k: case(
+        f"needles of aspect 1e{k}",
+        scales=10 ** (k * np.array([0.5, -0.5, -0.5])),
+        bounds=BEYOND if k > 9 else None,
+    )
+    for k in range(11)
+}
+# By distance over extent, through a lens in which the cloud fills the view. From 1e6 on, a float32
+# does not distinguish the depths of some Gaussians.
+DISTANCES = {
+    10.0**k: case(
+        f"distance 1e{k} times the extent",
+        eye(fov=np.rad2deg(2 * np.arctan(1.5 / 10.0**k)), origin=(0, 0, -(10.0**k))),
+        bounds=BEYOND if k > 5 else None,
+    )
+    for k in range(11)
+}
 # Errors reached on a 2-core x86, 80-bit reference: image at most 6e-6, gradients at most 2e-5 (4e-5
 # for needles across the screen), unless a comment states more. Limits: an aspect beyond 1e6 is
 # drawn at 1e6, because a float32 rotation is no more precise; beyond 1e18 units nothing is drawn;
 # depths that a float32 cannot distinguish are equal.
-CASES = [
-    case("plain"),
-    case("one Gaussian", n=1),
-    case("two Gaussians", n=2),
-    case("needles", scales=(1, 1e-4, 1e-4)),
-    case("needles across the screen", scales=(100, 1e-2, 1e-2)),
-    case("needles of 250,000 px", scales=(1e4, 1, 1)),
-    case(
-        "needles along the axis",
-        scales=(1e-4, 1e-4, 1),
-        means=lambda m: m * 0.05,
-        quats=(1, 0.0656, 0.0495, 0),
+CASES_BY_KIND = {
+    "ordinary": [
+        case("plain"),
+        case("one Gaussian", n=1),
+        case("two Gaussians", n=2),
+        case("camera rolled", eye(up=(0.6, -0.3, 0.1))),
+        case("camera upside down", eye(up=(0, 1, 0))),
+        case(
+            "one Gaussian in every block",
+            Camera(np.array([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]), np.eye(4), 64, 32),
+            n=64,
+            means=np.c_[(BLOCKS - (32, 16)) / 40 * 3, np.full(64, 3.0)],
+            scales=(0.04, 0.06, 0.05),
+            bounds=SLOW_REFERENCE,
+        ),
+    ],
+    "needles and discs": [
+        case("needles", scales=(1, 1e-4, 1e-4)),
+        case("needles across the screen", scales=(100, 1e-2, 1e-2)),
+        case("needles of 250,000 px", scales=(1e4, 1, 1)),
+        case(
+            "needles along the axis",
+            scales=(1e-4, 1e-4, 1),
+            means=lambda m: m * 0.05,
+            quats=(1, 0.0656, 0.0495, 0),
+        ),
+        case("discs", scales=(1, 1, 1e-4)),
+        case("discs across the screen", scales=(100, 100, 1e-2)),
+        case("needles 1e-6 x 1e3", scales=(1e3, 1e-6, 1e-6)),
+    ],
+    "aspects up to 1e9": [*NEEDLES.values()][:-1],
+    "distances up to 1e5": [*DISTANCES.values()][:6],
+    "beyond float32": [*NEEDLES.values()][-1:] + [*DISTANCES.values()][6:],
+    "scales": [
+        case("sub-pixel splats", scales=(1e-6, 2e-6, 3e-6)),
+        case("screen-filling splats", scales=(50, 70, 90)),
+        case("scales 0", scales=0),
+        case("scales 1e-38", scales=1e-38),
+        case("scales 1e6", scales=(1e6, 2e6, 3e6)),
+        case("scales 1e12", scales=(1e12, 2e12, 3e12)),
+        case("scales 3e38", scales=3e38),
+        case("scales 1e-30 to 1e12", scales=np.geomspace(1e-30, 1e12, 6)[:, None] * (1, 2, 3)),
+    ],
+    "near plane, camera inside": [
+        case("on the near plane", ORIGIN, means=AT_NEAR_PLANE, scales=(0.002, 0.001, 0.003)),
+        case("big, on the near plane", ORIGIN, means=AT_NEAR_PLANE, scales=(0.2, 0.1, 0.3)),
+        case(
+            "grazing the near plane, and at 1e17 units",
+            ORIGIN,
+            means=GRAZING,
+            scales=GRAZING_SCALES,
+        ),
+        case("all behind", ORIGIN, means=moved(0, 0, -5)),
+        case("camera inside", ORIGIN, means=lambda m: m * 0.01 + (0, 0, 0.03), scales=(3, 2, 5)),
+    ],
+    "coordinates": [
+        case("1e-3 units", eye(origin=(3e-4, -4e-4, -3e-3), near=1e-5), **scaled(1e-3)),
+        case("1e6 units", eye(origin=(3e5, -4e5, -3e6), near=1e4), **scaled(1e6)),
+        # Means there are multiples of 2^-7; no further precision is lost, because poses are summed
+        # in double.
+        case("offset by 1e5", eye(viewmat=eye().viewmat @ LIFT), means=moved(*FAR)),
+        case("equal depths", ORIGIN, means=lambda m: m * (0.5, 0.5, 0) + (0, 0, 2), opacities=0.9),
+        case("1e-6 units", eye(origin=(3e-7, -4e-7, -3e-6), near=1e-8), **scaled(1e-6)),
+        case("1e12 units away", eye(origin=(9e10, -1.2e11, -9e11), near=1e10), **scaled(3e11)),
+    ],
+    "opacities": [
+        case("opacities 0, 1 and near", opacities=[0, 1, 1e-7, 1 - 2**-23, 0.99, 0.004]),
+        case("opacities 1", opacities=1),
+        case("opacities 0", opacities=0),
+    ],
+    "quaternions": [
+        case("some quaternions 0", quats=lambda q: q * np.array([[0], [1], [0], [1], [1], [1]])),
+        case("quaternions 1e-25", quats=lambda q: q * 1e-25),
+        case("quaternions 1e33", quats=lambda q: q * 1e33),
+        # Their gradients of 1e-38 underflow float32 to zero.
+        case(
+            "quaternions 1e38", quats=lambda q: np.clip(q, -3, 3) * 1e38, bounds={"gradient": 1.0}
+        ),
+    ],
+    "colours": [
+        case(
+            "colours 1e6 and 1e-6",
+            sh_coeffs=lambda c: c * np.array([1e6, 1, 1e-6, 1, -1e6, 1])[:, None, None],
+        ),
+        case("colours 1e15", sh_coeffs=lambda c: c * 1e15),
+    ],
+    "images": [
+        case("image 1x1", eye(1, 1)),
+        case("image 33x1", eye(33, 1)),
+        case("image 1x65", eye(1, 65)),
+        case("image 4096x1", eye(4096, 1, shift=(1.3, 0)), bounds=SLOW_REFERENCE),
+        case("image 1x4096", eye(1, 4096, fov=0.02, shift=(0, 0)), bounds=SLOW_REFERENCE),
+    ],
+    "lenses": [
+        case(
+            "principal point outside",
+            eye(viewmat=np.eye(4), shift=(-200, 150)),
+            means=moved(23.7, -16.4, 3),
+        ),
+        # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; double precision there is
+        # not worth its cost.
+        case(
+            "principal point far outside",
+            eye(viewmat=np.eye(4), shift=(-2e4, 1e4)),
+            means=moved(2367, -1096, 3),
+            bounds=screen_bound(2e4),
+        ),
+        case("lens of 0.01 degrees", eye(fov=0.01, origin=(1e3, 2e3, -1e4))),
+        case("lens of 179.9 degrees", eye(fov=179.9, origin=(0.1, 0.1, -0.5))),
+        # Depths are 1e-8 of the distance, so all of them are equal in float32.
+        case(
+            "lens of 1e-6 degrees",
+            eye(fov=1e-6, origin=(0, 0, -1e8), shift=(0, 0)),
+            means=lambda m: m[np.argsort(m[:, 2])],
+        ),
+    ],
+    "motion": [
+        case("motion through the camera", ORIGIN, means=moved(0, 0, 3), motion=THROUGH),
+        case("motion 1e12 units", motion=lambda m: m * 1e12),
+    ],
+}
+CASES = [case for cases in CASES_BY_KIND.values() for case in cases]
+
+# What `rasterize` refuses, with the sentence.
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "overflow": (
+        {"log_scales": np.full((6, 3), 100.0)},
+        r"`scales` must be finite, got inf at \[0, 0\]",
     ),
-    case("discs", scales=(1, 1, 1e-4)),
-    case("discs across the screen", scales=(100, 100, 1e-2)),
-    case("sub-pixel splats", scales=(1e-6, 2e-6, 3e-6)),
-    case("screen-filling splats", scales=(50, 70, 90)),
-    case("scales 0", scales=0),
-    case("scales 1e-38", scales=1e-38),
-    case("scales 1e6", scales=(1e6, 2e6, 3e6)),
-    case("scales 1e12", scales=(1e12, 2e12, 3e12)),
-    case("scales 3e38", scales=3e38),
-    case("on the near plane", ORIGIN, means=AT_NEAR_PLANE, scales=(0.002, 0.001, 0.003)),
-    case("big, on the near plane", ORIGIN, means=AT_NEAR_PLANE, scales=(0.2, 0.1, 0.3)),
-    case("grazing the near plane, and at 1e17 units", ORIGIN, means=GRAZING, scales=GRAZING_SCALES),
-    case("all behind", ORIGIN, means=moved(0, 0, -5)),
-    case("1e-3 units", eye(origin=(3e-4, -4e-4, -3e-3), near=1e-5), **scaled(1e-3)),
-    case("1e6 units", eye(origin=(3e5, -4e5, -3e6), near=1e4), **scaled(1e6)),
-    # Means there are multiples of 2^-7; no further precision is lost, because poses are summed in
-    # double.
-    case("offset by 1e5", eye(viewmat=eye().viewmat @ LIFT), means=moved(*FAR)),
-    case("opacities 0, 1 and near", opacities=[0, 1, 1e-7, 1 - 2**-23, 0.99, 0.004]),
-    case("opacities 1", opacities=1),
-    case("opacities 0", opacities=0),
-    case("equal depths", ORIGIN, means=lambda m: m * (0.5, 0.5, 0) + (0, 0, 2), opacities=0.9),
-    case("some quaternions 0", quats=lambda q: q * np.array([[0], [1], [0], [1], [1], [1]])),
-    case("quaternions 1e-25", quats=lambda q: q * 1e-25),
-    case("quaternions 1e33", quats=lambda q: q * 1e33),
-    # Their gradients of 1e-38 underflow float32 to zero.
-    case("quaternions 1e38", quats=lambda q: np.clip(q, -3, 3) * 1e38, bounds={"gradient": 1.0}),
-    case(
-        "colours 1e6 and 1e-6",
-        sh_coeffs=lambda c: c * np.array([1e6, 1, 1e-6, 1, -1e6, 1])[:, None, None],
+    "infinite mean": (
+        {"means": np.full((6, 3), [0, 0, -np.inf])},
+        r"`means` must be finite, got -inf at \[0, 2\]",
     ),
-    case("colours 1e15", sh_coeffs=lambda c: c * 1e15),
-    case("image 1x1", eye(1, 1)),
-    case("image 33x1", eye(33, 1)),
-    case("image 1x65", eye(1, 65)),
-    case("image 4096x1", eye(4096, 1, shift=(1.3, 0)), bounds=SLOW_REFERENCE),
-    case("image 1x4096", eye(1, 4096, fov=0.02, shift=(0, 0)), bounds=SLOW_REFERENCE),
-    case(
-        "one Gaussian in every block",
-        Camera(np.array([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]), np.eye(4), 64, 32),
-        n=64,
-        means=np.c_[(BLOCKS - (32, 16)) / 40 * 3, np.full(64, 3.0)],
-        scales=(0.04, 0.06, 0.05),
-        bounds=SLOW_REFERENCE,
+    "behind": (
+        {"means": np.full((6, 3), [0, 0, -10.0]), "quats": np.full((6, 4), np.nan)},
+        "`quats` must be finite",
     ),
-    case("camera rolled", eye(up=(0.6, -0.3, 0.1))),
-    case("camera upside down", eye(up=(0, 1, 0))),
-    case(
-        "principal point outside",
-        eye(viewmat=np.eye(4), shift=(-200, 150)),
-        means=moved(23.7, -16.4, 3),
+    "one component": (
+        {"quats": np.full((6, 4), [0, 0, 0, np.nan])},
+        r"`quats` must be finite, got nan at \[0, 3\]",
     ),
-    # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; double precision there is not
-    # worth its cost.
-    case(
-        "principal point far outside",
-        eye(viewmat=np.eye(4), shift=(-2e4, 1e4)),
-        means=moved(2367, -1096, 3),
-        bounds=screen_bound(2e4),
+    "colours": (
+        {"sh_coeffs": np.full((6, 4, 3), 3e38)},
+        r"`sh_coeffs` must be at most 1e18, got 3e\+38 at \[0, 0, 0\] \(72 ",
     ),
-    case("lens of 0.01 degrees", eye(fov=0.01, origin=(1e3, 2e3, -1e4))),
-    case("lens of 179.9 degrees", eye(fov=179.9, origin=(0.1, 0.1, -0.5))),
-]
+    "negative colours": (
+        {"sh_coeffs": np.full((6, 4, 3), -1e20)},
+        r"`sh_coeffs` must be at most 1e18, got -1e\+20",
+    ),
+    "motion": (
+        {"motion": np.full((6, 3), 1e30)},
+        r"`motion` must be at most 1e18, got 1e\+30 at \[0, 0\]",
+    ),
+}
+
+
+ONE_PIXEL = Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
+
+
+def stack(n: int, opacity: float) -> Values:
+    """Return n Gaussians of various colours behind each other, for a camera at the origin."""
+    values = cloud(n)
+    values |= {
+        "means": np.c_[np.zeros((n, 2)), np.linspace(1, 2, n)],
+        "opacities": np.full(n, opacity),
+    }
+    values["sh_coeffs"] = np.clip(values["sh_coeffs"], -0.4, 0.4)
+    return {name: np.float32(value).astype(np.float64) for name, value in values.items()}
+
+
+def million_on_a_pixel() -> dict[str, float]:
+    """Return the relative errors of the image and the gradients of a million faint Gaussians."""
+    values = stack(1_000_000, 0.004)
+    values["means"][:, :2] = np.random.default_rng(0).normal(size=(1_000_000, 2)) * 0.1
+    names = ("means", "scales", "quats", "opacities", "sh_coeffs")
+    gaussians = Gaussians.from_activated(*(values[name] for name in names))
+    config = RenderConfig(alpha_min=1e-6, stop_transmittance=1e-12)
+    color, expected = reference64(gaussians, ONE_PIXEL, np.zeros((1, 2)), np.ones((1, 3)), config)
+    dr.enable_grad(*gaussians.items().values())
+    image = rasterize(gaussians, ONE_PIXEL, ("color",), config=config).color
+    dr.backward(dr.sum(image, axis=None))
+    result = {"image": float(np.abs(np.asarray(dr.detach(image)).ravel() - color.ravel()).max())}
+    gradients = {name: np.asarray(dr.grad(getattr(gaussians, name))) for name in expected}
+    # Per relative change, as those of logarithms are.
+    lengths = np.linalg.norm(values["quats"], axis=1, keepdims=True)
+    for grads in (expected, gradients):
+        grads["quats"] = grads["quats"] * lengths
+    largest = {name: float(np.abs(exact).max()) for name, exact in expected.items()}
+    # Sums of the same terms: one that almost vanishes is compared relative to the largest.
+    floor = 0.01 * max(largest[name] for name in ("log_scales", "quats", "logit_opacities"))
+    for activated_name, (name, exact) in zip(names, expected.items(), strict=True):
+        off = float(np.abs(gradients[name] - exact).max())
+        result[activated_name] = off / max(largest[name], floor)
+    return result
+
+
+def raw_gaussians(**change: Any) -> Gaussians:
+    values = cloud()
+    raw = {name: values[name] for name in ("means", "quats", "sh_coeffs", "motion")}
+    raw |= {
+        "log_scales": np.log(values["scales"]),
+        "logit_opacities": np.zeros(6),
+        "logit_confidence": np.zeros(6),
+    }
+    gaussians = Gaussians(**(raw | change))
+    dr.enable_grad(*gaussians.items().values())
+    return gaussians
 
 
 def random_case(seed: int) -> Case:
