@@ -11,27 +11,11 @@ import numpy as np
 import pytest
 from drjit.opt import Adam
 
-from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi import Gaussians, rasterize
 from tests import reference
 from tests.render.exact import BACKGROUND, CONFIG
+from tests.scenes.extremes import STIFF_CAMERA, stiff_truth
 from tests.scenes.gaussians import CHANNELS, Values
-
-CAMERA = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
-
-
-def stiff_truth() -> Values:
-    """Return raw attributes of a needle seen along its axis before an almost opaque disc."""
-    sh_coeffs = np.zeros((2, 4, 3))
-    sh_coeffs[:, 0] = [[1.0, 0.2, -0.5], [-0.5, 0.4, 1.0]]
-    return {
-        "means": np.array([[0.1, 0.05, 4.0], [-0.2, 0.1, 6.0]]),
-        "log_scales": np.log([[0.04, 0.04, 4.0], [1.0, 0.7, 0.01]]),
-        "quats": np.array([[1, 0.01, 0.02, 0], [1, 0.1, -0.1, 0.3]]),
-        "logit_opacities": np.array([0.5, 7.0]),
-        "sh_coeffs": sh_coeffs,
-        "motion": np.zeros((2, 3)),
-        "logit_confidence": np.zeros(2),
-    }
 
 
 def descend(rate: float, steps: int) -> tuple[list[float], Values]:
@@ -40,7 +24,7 @@ def descend(rate: float, steps: int) -> tuple[list[float], Values]:
     """
 
     def render(gaussians: Gaussians) -> Any:
-        return rasterize(gaussians, CAMERA, CHANNELS, BACKGROUND, config=CONFIG).color
+        return rasterize(gaussians, STIFF_CAMERA, CHANNELS, BACKGROUND, config=CONFIG).color
 
     truth = stiff_truth()
     rng = np.random.default_rng(0)
@@ -71,9 +55,9 @@ def test_stiff_truth__is_stiff():
             along = np.zeros(truth[name].shape)
             along[index] = 1
             slope = reference.directional(
-                lambda v: reference.rasterize(v, CAMERA.K, CAMERA.viewmat, 32, 24, BACKGROUND)[
-                    "color"
-                ],
+                lambda v: reference.rasterize(
+                    v, STIFF_CAMERA.K, STIFF_CAMERA.viewmat, 32, 24, BACKGROUND
+                )["color"],
                 truth,
                 {name: along},
             )

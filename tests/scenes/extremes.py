@@ -127,6 +127,37 @@ BLOCKS = np.stack(np.meshgrid(np.arange(8) * 8 + 4.0, np.arange(8) * 4 + 2.0), -
 # From behind the camera, from its near plane on, and from beyond the point where they are.
 THROUGH = [[0, 0, 9], [0.1, 0, 3.5], [0, 0.2, 2.999], [0, 0, -40], [1, 1, 3e3], [0, 0, 0]]
 SLOW_REFERENCE = {"every_entry": False}
+STIFF_CAMERA = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
+
+
+def stiff_truth() -> Values:
+    """Return raw attributes of a needle seen along its axis before an almost opaque disc."""
+    sh_coeffs = np.zeros((2, 4, 3))
+    sh_coeffs[:, 0] = [[1.0, 0.2, -0.5], [-0.5, 0.4, 1.0]]
+    return {
+        "means": np.array([[0.1, 0.05, 4.0], [-0.2, 0.1, 6.0]]),
+        "log_scales": np.log([[0.04, 0.04, 4.0], [1.0, 0.7, 0.01]]),
+        "quats": np.array([[1, 0.01, 0.02, 0], [1, 0.1, -0.1, 0.3]]),
+        "logit_opacities": np.array([0.5, 7.0]),
+        "sh_coeffs": sh_coeffs,
+        "motion": np.zeros((2, 3)),
+        "logit_confidence": np.zeros(2),
+    }
+
+
+def stiff_case() -> Case:
+    """Return the case of `stiff_truth`."""
+    raw = stiff_truth()
+    values = {name: raw[name] for name in ("means", "quats", "sh_coeffs", "motion")}
+    values |= {
+        "scales": np.exp(raw["log_scales"]),
+        "opacities": 1 / (1 + np.exp(-raw["logit_opacities"])),
+        "confidence": 1 / (1 + np.exp(-raw["logit_confidence"])),
+    }
+    values = {key: np.float32(value).astype(np.float64) for key, value in values.items()}
+    return Case("needle along its axis, before a disc", values, STIFF_CAMERA)
+
+
 # Beyond what float32 can hold: bounds of the errors that are reached.
 BEYOND = {"image": 2.0, "gradient": 10.0}
 # By the ratio of the largest to the smallest scale. The last ones are 2.5e6 px long and 0.5 px wide
@@ -170,6 +201,7 @@ CASES_BY_KIND = {
         ),
     ],
     "needles and discs": [
+        stiff_case(),
         case("needles", scales=(1, 1e-4, 1e-4)),
         case("needles across the screen", scales=(100, 1e-2, 1e-2)),
         case("needles of 250,000 px", scales=(1e4, 1, 1)),
