@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from io import StringIO
-from itertools import groupby
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -160,30 +160,32 @@ def accuracy(
     scales = np.array([*map(np.linalg.norm, expected.values())]) + 1e-30
     scales[2:5] = scales[2:5].clip(0.01 * scales[2:5].max())
 
+    configs = {name: replace(config, **change) for name, change in CHANGES.items()}
+    times: dict[str, list[float]] = {name: [] for name in configs}
+    errors: dict[str, dict[str, float]] = {}
     stage = Progress(progress, "Measuring settings")
-    rows: list[Setting] = []
-    for name, change in CHANGES.items():
-        stage(len(rows), len(CHANGES))
-        setting = replace(config, **change)
-        times = []
-        results: list[Any] = []
-        for _ in range(1 + ROUNDS):  # the first one compiles
-            dr.sync_thread()
-            start = time.perf_counter()
-            image = rasterize(gaussians, camera, ("color",), config=setting).color
-            dr.backward(dr.sum(image * weights32, axis=None))
-            results = dr.grad(tensors)
-            dr.eval(results)
-            dr.sync_thread()
-            times.append(time.perf_counter() - start)
-            dr.clear_grad(tensors)
-            results = [np.array(image)[mask], *results]
-        errors = {
+    # In turns, because other programs may slow down some of them; the first round compiles.
+    steps = list(product(range(1 + ROUNDS), configs.items()))
+    for done, (_, (name, setting)) in enumerate(steps):
+        stage(done, len(steps))
+        dr.sync_thread()
+        start = time.perf_counter()
+        image = rasterize(gaussians, camera, ("color",), config=setting).color
+        dr.backward(dr.sum(image * weights32, axis=None))
+        results: list[Any] = dr.grad(tensors)
+        dr.eval(results)
+        dr.sync_thread()
+        times[name].append(time.perf_counter() - start)
+        dr.clear_grad(tensors)
+        results = [np.array(image)[mask], *results]
+        errors[name] = {
             key: float(np.linalg.norm(result - value) / scale)
             for (key, value), result, scale in zip(expected.items(), results, scales, strict=True)
         }
-        rows.append(Setting(name, setting, float(np.median(times[1:])), errors))
-    stage(len(rows), len(CHANGES))
+    rows = tuple(
+        Setting(name, setting, float(np.median(times[name][1:])), errors[name])
+        for name, setting in configs.items()
+    )
     precise = [row for row in rows if max(row.errors.values()) <= tolerance]
     fastest = min(precise, key=lambda row: row.seconds).config if precise else None
-    return Accuracy(tuple(rows), tolerance, fastest)
+    return Accuracy(rows, tolerance, fastest)
