@@ -29,11 +29,11 @@ _HEADER = {
 }
 _CAMERA = {
     "name": (str, 0, math.inf, "a string"),
+    "K": (list, 3, 3, "three lists of three numbers"),
+    "viewmat": (list, 4, 4, "four lists of four numbers"),
     "width": (int, 1, _MAX_PIXELS, "an integer from 1 to 2^26"),
     "height": (int, 1, _MAX_PIXELS, "an integer from 1 to 2^26"),
     "near": (float, 1 / LARGEST, LARGEST, "a number from 1e-12 to 1e12"),
-    "K": (list, 3, 3, "three lists of three numbers"),
-    "viewmat": (list, 4, 4, "four lists of four numbers"),
 }
 
 
@@ -44,26 +44,20 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
         ValueError: JSON cannot represent it, or a reader would refuse it.
     """
     fields = {
-        "cameras": [
-            {
-                "name": camera.name,
-                "K": camera.K.tolist(),
-                "viewmat": np.asarray(camera.viewmat, dtype=np.float64).tolist(),
-                "width": camera.width,
-                "height": camera.height,
-                "near": camera.near,
-            }
-            for camera in cameras
-        ],
+        "cameras": [{key: getattr(camera, key) for key in _CAMERA} for camera in cameras],
         "fps": float(fps),
         "metadata": dict(metadata),
     }
     try:
-        text = json.dumps(fields, allow_nan=False)
+        text = json.dumps(fields, allow_nan=False, default=_matrix_rows)
         header_fields(text.encode())
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"StreamWriter(): a reader would refuse the header: {error}.") from None
     return text
+
+
+def _matrix_rows(matrix: Any) -> list[list[float]]:
+    return np.asarray(matrix, dtype=np.float64).tolist()
 
 
 def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
@@ -123,7 +117,7 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     Raises:
         ValueError: an entry is missing, or has another type or range than it must have.
     """
-    name, width, height, near, *rows = _entries(fields, _CAMERA, f"{where}.")
+    name, *rows, width, height, near = _entries(fields, _CAMERA, f"{where}.")
     K, viewmat = (numbers(where, "matrix", matrix) for matrix in rows)
     is_view = (K.shape, viewmat.shape) == ((3, 3), (4, 4)) and bounded(K) and bounded(viewmat)
     if not is_view or not name.isprintable() or width * height > _MAX_PIXELS:

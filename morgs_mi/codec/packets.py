@@ -107,14 +107,13 @@ def reemitted_keyframe(coded: CodedFrame) -> Packet:
     loss.
     """
     grid = coded.grid
-    writer = ColumnWriter()
-    writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
-    _put_grid(writer, grid)
+    gaps = np.diff(coded.ids.astype(np.int64), prepend=-1) - 1
+    words = _words(chain([gaps], _grid_columns(grid)))
     head = np.array([len(grid), grid.degree, grid.optional, coded.next_id], np.uint32)
     return Packet(
         PacketKind.KEYFRAME,
         coded.frame,
-        {"head": head, "code": _padded(writer.words(), len(grid), len(grid), grid.num_integers)},
+        {"head": head, "code": _padded(words, len(grid), len(grid), grid.num_integers)},
     )
 
 
@@ -329,7 +328,8 @@ def _taken_columns(
     return columns
 
 
-def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
+def _grid_columns(grid: Grid) -> Iterator[np.ndarray]:
+    """Yield the columns of new Gaussians, as `_taken_grid` reads them."""
     columns = np.concatenate(
         [grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64
     )
@@ -337,28 +337,27 @@ def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     if len(columns):
         middle = np.sort(columns, axis=0)[len(columns) // 2]
         middle[np.abs(columns - middle).max(0) >= LIMIT] = 0
-    writer.put(middle)
+    yield middle
     # Small integers have a token of their own, large ones one per octave.
-    for column in (columns - middle).T:
+    yield from (columns - middle).T
+
+
+def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
+    writer = ColumnWriter()
+    for column in columns:
         writer.put(column)
+    return writer.words()
 
 
 def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid) -> dict[str, np.ndarray]:
     """Return the words of the changes with a quantizer step, and of the births."""
     r = coder.rounded(quantizer_step)
-    writer = ColumnWriter()
-    for column in coder.columns(r):
-        writer.put(column)
     births = len(birth_grid)
-    if births:
-        _put_grid(writer, birth_grid)
+    words = _words(chain(coder.columns(r), _grid_columns(birth_grid) if births else ()))
     total = len(coder.survivors) + births
-    codes = {"code": _padded(writer.words(), births, total, birth_grid.num_integers)}
+    codes = {"code": _padded(words, births, total, birth_grid.num_integers)}
     if coder.offset is not None:
-        offset_writer = ColumnWriter()
-        for column in coder.offsets(r, quantizer_step):
-            offset_writer.put(column)
-        codes["offset"] = offset_writer.words()
+        codes["offset"] = _words(coder.offsets(r, quantizer_step))
     return codes
 
 

@@ -32,7 +32,8 @@ from morgs_mi.core.bounded import open_regular
 
 _READ_SIZE = 2**20
 
-_Entry = tuple[int, int, int]
+Entry = tuple[int, int, int]
+"""(kind, frame, offset) of a packet."""
 
 
 class StreamReader(FrameSource):
@@ -89,7 +90,7 @@ class StreamReader(FrameSource):
                 raise ValueError(f"the first packet must be the header, got kind {kind}")
             self.cameras, self.fps, self.metadata = header_fields(payload)
         self._first = PREAMBLE.size + len(data)
-        self._playable_entries: list[_Entry] | None = None
+        self._playable_entries: list[Entry] | None = None
         self.skipped: list[int] = []
         if skip_damaged:
             self._playable_entries, self.skipped = self._playable()
@@ -157,7 +158,7 @@ class StreamReader(FrameSource):
         with self._file() as file:
             return self._last_index(file) is not None
 
-    def index(self) -> list[_Entry]:
+    def index(self) -> list[Entry]:
         """Return (kind, frame, offset) of every complete packet except the header, from the index
         if there is one.
 
@@ -185,11 +186,11 @@ class StreamReader(FrameSource):
                 at += PAYLOAD + length
             return entries
 
-    def _playable(self) -> tuple[list[_Entry], list[int]]:
+    def _playable(self) -> tuple[list[Entry], list[int]]:
         """Return the entries of the packets that play without the damaged ones, and the frames that
         do not play.
         """
-        entries = list[_Entry]()
+        entries = list[Entry]()
         frames = [-1]
         plays = False
         with self._file() as file:
@@ -209,7 +210,7 @@ class StreamReader(FrameSource):
                     entries.append((kind, frame, offset))
         return entries, sorted({*frames[1:]} - {frame for _, frame, _ in entries})
 
-    def _last_index(self, file: BinaryIO) -> list[_Entry] | None:
+    def _last_index(self, file: BinaryIO) -> list[Entry] | None:
         """Return the entries of the index at the file's end, None if there is none."""
         size = file.seek(0, 2)
         if size < self._first:
@@ -236,7 +237,7 @@ class StreamReader(FrameSource):
         )
         return entries if is_index else None
 
-    def check(self) -> tuple[list[_Entry], int]:
+    def check(self) -> tuple[list[Entry], int]:
         """Check every packet and return (kind, frame, offset) of all except the header, and the end
         of the last one.
 

@@ -15,9 +15,9 @@ import numpy as np
 from morgs_mi.codec.entropy import LIMIT, ColumnReader
 from morgs_mi.codec.quantisation import GROUPS, Grid, bounded, step_sizes
 
-_GEOMETRY = GROUPS[:3]
-_APPEARANCE = GROUPS[3:]
-_DEAD = 8  # flags of the geometry of a Gaussian that dies; the three groups are its lower bits
+# Flags of the geometry of a Gaussian that dies; the first three groups are the bits below, all
+# others those above.
+_DEAD = 8
 # Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly
 # less than a step, because a decoded state is rounded to float32 and must give the packet that it
 # was decoded from.
@@ -49,17 +49,18 @@ class Coder:
 
     def columns(self, r: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the columns of changes `r` [C, N] and of the deaths; `take_change` reads them."""
-        change_masks = {name: np.any(r[at], axis=0) for name, at in self.grid.columns.items()}
+        flags = np.zeros(len(self.grid), np.int32)
+        for name, at in self.grid.columns.items():
+            flags |= np.any(r[at], axis=0).astype(np.int32) << GROUPS.index(name)
         dead = np.ones(len(self.grid), bool)
         dead[self.survivors] = False
-        geometry = np.where(dead, _DEAD, _flags(change_masks, _GEOMETRY, len(self.grid)))
-        appearance = _flags(change_masks, _APPEARANCE, len(self.grid))
+        geometry = np.where(dead, _DEAD, flags % _DEAD)
         for rows in _classes(self.grid):
             yield geometry[rows]
             for some in _shape_classes(geometry[rows]):
-                yield appearance[rows[some]]
+                yield flags[rows[some]] // _DEAD
             for name, at in self.grid.columns.items():
-                yield from r[at].take(rows[change_masks[name][rows]], axis=1)
+                yield from r[at].take(rows[flags[rows] >> GROUPS.index(name) & 1 == 1], axis=1)
 
     def offsets(self, r: np.ndarray, quantizer_step: int) -> Iterator[np.ndarray]:
         """Yield the columns of the offsets of the survivors with changed means; none if they are
@@ -92,7 +93,7 @@ def take_change(
     values = grid.values.copy()
     dead = np.zeros(len(grid), bool)
     step = _step(quantizer_step)
-    bits = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
+    bits = sum(1 << GROUPS.index(name) for name in grid.columns) // _DEAD
     for rows in _classes(grid):
         geometry = reader.take(len(rows))
         appearance = np.zeros(len(rows), np.int64)
@@ -113,15 +114,6 @@ def take_change(
 def _shape_classes(geometry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the masks of the Gaussians that keep their geometry, and of those that change it."""
     return geometry == 0, (geometry > 0) & (geometry < _DEAD)
-
-
-def _flags(change_masks: dict[str, np.ndarray], names: tuple[str, ...], N: int) -> np.ndarray:
-    """Return the sum of 2^k [N] over the groups `names` that change; k is the place of a group."""
-    flags = np.zeros(N, np.int32)
-    for bit, name in enumerate(names):
-        if name in change_masks:
-            flags |= change_masks[name].astype(np.int32) << bit
-    return flags
 
 
 def _classes(grid: Grid) -> list[np.ndarray]:

@@ -74,13 +74,9 @@ def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTrut
         return None
     truth = load_truth(capture.truth, camera.name, frame)
     H, W = truth.mask.shape
-    rows = _nearest_pixels(camera.height, H)[:, None]
-    columns = _nearest_pixels(camera.width, W)
-    stretch = np.array([camera.width / W, camera.height / H], np.float32)
-    motion = truth.motion[rows, columns] * stretch
-    return GroundTruth(
-        motion, *(values[rows, columns] for values in (truth.depth, truth.ids, truth.mask))
-    )
+    at = np.ix_(_nearest_pixels(camera.height, H), _nearest_pixels(camera.width, W))
+    motion = truth.motion[at] * np.array([camera.width / W, camera.height / H], np.float32)
+    return GroundTruth(motion, truth.depth[at], truth.ids[at], truth.mask[at])
 
 
 def _nearest_pixels(count: int, length: int) -> np.ndarray:

@@ -18,9 +18,8 @@ from morgs_mi.core.fit_names import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
-from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
+from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig, trained_cameras
 from morgs_mi.playback.export.web import stream_html
-from morgs_mi.playback.trained_cameras import trained_cameras
 
 DRAWN = 0.5
 """Share of invalid Gaussians up to which a file is drawn without them: beyond, the file as a whole

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -81,16 +81,13 @@ def stream_capture(
     stages = Progress(progress)
     with locked_folder(out, "stream_capture()"):
         files = FitFiles.of(out)
-        frames = capture.partial_frames()
-        first = next(frames)
+        first = next(capture.partial_frames(0, 1))
         metadata = stream_metadata(capture, first, config)
         earlier = interrupted_fit(files, capture, metadata) if resume else None
         if earlier is None:
             prepared = Prepared.of(capture, config, stages)
             loop = StreamLoop.of(prepared.capture, config)
-            frames = chain((first,), frames)
-            if prepared.refinement is not None:
-                frames = prepared.capture.partial_frames()
+            frames = prepared.capture.partial_frames()
         else:
             prepared = Prepared(as_fitted(capture, earlier.stream))
             loop = StreamLoop.of(prepared.capture, config)

@@ -38,7 +38,7 @@ from morgs_mi.codec.container import (
     header_json,
 )
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.reader import Entry, StreamReader
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_path, is_same_file, write_json
@@ -52,9 +52,6 @@ _LOG = logging.getLogger(__name__)
 
 FILES = (STREAM, CAPTURE, REPORT)
 """Names of the files that a fit writes into its folder."""
-
-Entry = tuple[int, int, int]
-"""(kind, frame, offset) of a packet."""
 
 
 class FitFiles(NamedTuple):
@@ -162,7 +159,10 @@ class Recording:
                     self._writer.write(packet)
         self._written = os.stat(self._written_files.stream)
         if self._written_files.description is not None:
-            description = described_capture(capture, files.description if earlier else None)
+            description = capture.metadata()
+            with suppress(OSError, ValueError, TypeError):
+                description |= read_json(self._written_files.description) if earlier else {}
+            description["capture"] = str(Path(capture.path).resolve())
             write_json(self._written_files.description, description)
 
     def __enter__(self) -> Recording:
@@ -381,20 +381,6 @@ def _without_folder(method: str) -> str:
     """Return a method such as ``onnx:FILE`` with the name of its file alone."""
     kind, colon, files = method.partition(":")
     return kind + colon + ",".join(Path(file).name for file in files.split(","))
-
-
-def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
-    """Return the content of `capture.json`: an earlier fit's if there is one, with the capture's
-    present path.
-    """
-    description = None
-    if earlier is not None:
-        with suppress(OSError, ValueError):
-            description = read_json(earlier)
-    return {
-        **(description if isinstance(description, dict) else capture.metadata()),
-        "capture": str(Path(capture.path).resolve()),
-    }
 
 
 def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:

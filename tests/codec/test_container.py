@@ -265,9 +265,7 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
         StreamReader(path)
     with pytest.raises(FileNotFoundError):
         StreamReader(tmp_path / "none")
-    with pytest.raises(
-        ValueError, match=r"a reader would refuse the header: .* not JSON serializable"
-    ):
+    with pytest.raises(ValueError, match="a reader would refuse the header: "):
         StreamWriter(tmp_path / "t", cameras(), 30, {"a": object()})
     assert not (tmp_path / "t").exists()
 

@@ -113,13 +113,11 @@ def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     parallel axes.
     """
     weight = _MEDIAN_WEIGHT * len(cameras)
-    A = weight * np.eye(3)
-    b = weight * np.median(means, axis=0)
-    for camera in cameras:
-        axis = np.asarray(camera.viewmat, np.float64)[2, :3]
-        across = np.eye(3) - np.outer(axis, axis)
-        A = A + across
-        b = b + across @ camera.position
+    axes = np.array([np.asarray(camera.viewmat, np.float64)[2, :3] for camera in cameras])
+    positions = np.array([camera.position for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    A = weight * np.eye(3) + across.sum(axis=0)
+    b = weight * np.median(means, axis=0) + np.einsum("nij,nj->i", across, positions)
     return np.linalg.solve(A, b)
 
 

@@ -16,7 +16,6 @@ import re
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +44,7 @@ Progress = Callable[[int], None]
 # What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
 _UNSAFE = (0x00, 0x0D, 0x3C)
 _MODULE = "morgs-spark.js"
+_FOLDER = files("morgs_mi.playback.export") / "web_player"
 # Gaussians per frame and camera from which the scale of the motion is estimated.
 _SAMPLES = 500
 # Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show
@@ -121,9 +121,8 @@ def write_web_folder(
         OSError: the folder cannot be written.
     """
     data = published_bytes(stream, progress)
-    place = f'<i id="stream" data-address="{STREAM}" hidden></i>'
-    page = _page(title or stream_name(stream), place, "'self' data: blob:")
-    contents = {"index.html": page, STREAM: data, _MODULE: (_player() / _MODULE).read_bytes()}
+    page = served_page(title or stream_name(stream))
+    contents = {"index.html": page, STREAM: data, _MODULE: (_FOLDER / _MODULE).read_bytes()}
     with atomic_folder(path, "write_web_folder()") as partial:
         for name, content in contents.items():
             (partial / name).write_bytes(content)
@@ -155,15 +154,16 @@ def stream_html(stream: FrameSource) -> str:
     return _POSTER.format(title=title, style=style, image=image, text=text)
 
 
-def served_page(title: str, has_recording: bool) -> bytes:
-    """Return the page for the server of `playback.viewer`, which has the stream as a file.
+def served_page(title: str, server: str | None = None) -> bytes:
+    """Return the page for a server that has the stream as a file.
 
     Args:
         title: its title.
-        has_recording: whether the server has recorded images.
+        server: for the server of `playback.viewer`: ``recorded`` if it has recorded images, or
+            empty; None for any other.
     """
-    server = "recorded" if has_recording else ""
-    place = f'<i id="stream" data-address="{STREAM}" data-server="{server}" hidden></i>'
+    attribute = "" if server is None else f' data-server="{server}"'
+    place = f'<i id="stream" data-address="{STREAM}"{attribute} hidden></i>'
     return _page(title, place, "'self' data: blob:")
 
 
@@ -239,19 +239,14 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     return np.hstack(views)
 
 
-def _player() -> Traversable:
-    return files("morgs_mi.playback.export") / "web_player"
-
-
 def _page(title: str, data: str, connect: str) -> bytes:
-    player = _player()
-    code = gzip.compress((player / "player.js").read_bytes(), 9, mtime=0)
-    page = (player / "player.html").read_text(encoding="utf-8")
+    code = gzip.compress((_FOLDER / "player.js").read_bytes(), 9, mtime=0)
+    page = (_FOLDER / "player.html").read_text(encoding="utf-8")
     values = {
         "{version}": version("morgs-mi"),
         "{connect}": connect,
         "{title}": html.escape(title),
-        "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
+        "{notice}": (_FOLDER / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }
     names = "|".join(map(re.escape, values))

@@ -153,9 +153,8 @@ class Viewer:
         )
 
     def _send_page(self, _: Request) -> Response:
-        return HTMLResponse(
-            served_page(stream_name(self._stream), self._recorded.are_present(self._stream))
-        )
+        server = "recorded" if self._recorded.are_present(self._stream) else ""
+        return HTMLResponse(served_page(stream_name(self._stream), server))
 
     def _send_stream(self, request: Request) -> Response:
         return _stream_response(self._newest(), request)
