@@ -223,8 +223,10 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
         like = replace(like, K=intrinsics_of_fov(float(key["fov_x"]), like.width, like.height))
     if "viewmat" in key:
         return replace(like, viewmat=rigid("`viewmat`", np.asarray(key["viewmat"], np.float64)))
-    position, target = (np.asarray(key[name], np.float64) for name in ("position", "target"))
-    up = np.asarray(key["up"], np.float64) if "up" in key else up_direction(cameras)
+    key = {"up": up_direction(cameras), **key}
+    position, target, up = (
+        np.asarray(key[name], np.float64).reshape(3) for name in ("position", "target", "up")
+    )
     if not np.cross(target - position, up).any():
         raise ValueError("the view must not be along `up`")
     return _look_at(position, target, up, like)
