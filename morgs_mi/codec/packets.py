@@ -248,15 +248,6 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         raise ValueError(f"{where}: {error}.") from None
 
 
-def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
-    """Decode packets in order and yield the state after each frame."""
-    coded = None
-    for packet in packets:
-        if coded is None or (packet.kind, packet.frame) != (PacketKind.KEYFRAME, coded.frame):
-            coded = decode(coded, packet)
-            yield coded  # a re-emitted keyframe is for readers that start there
-
-
 def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     limits = {"N": 2**32 - 1, "degree": 3, "optional": KNOWN_OPTIONAL, "next_id": LIMIT - 1}
     N, degree, optional, next_id = _head(packet, limits)
@@ -326,6 +317,15 @@ def _taken_columns(
     for column, shift in zip(columns.T, shifts, strict=True):
         column[:] = bounded(reader.take(N) + shift, low, high)
     return columns
+
+
+def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
+    """Decode packets in order and yield the state after each frame."""
+    coded = None
+    for packet in packets:
+        if coded is None or (packet.kind, packet.frame) != (PacketKind.KEYFRAME, coded.frame):
+            coded = decode(coded, packet)
+            yield coded  # a re-emitted keyframe is for readers that start there
 
 
 def _grid_columns(grid: Grid) -> Iterator[np.ndarray]:
