@@ -173,7 +173,7 @@ def test_push__returns_a_keyframe_and_then_residuals(full):
         PacketKind.RESIDUAL,
     ]
     assert [r.frame for r in reports] == [p.frame for p in packets] == [0, 1, 2]
-    with pytest.raises(ValueError, match="a residual needs the frame before it"):
+    with pytest.raises(ValueError, match="it does not continue a state; a packet is missing"):
         decode(None, packets[1])
 
 

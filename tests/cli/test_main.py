@@ -259,7 +259,7 @@ def test_main__names_a_missing_or_empty_stream(stream: Path, tmp_path: Path, run
     for output in (tmp_path / "a.mp4", tmp_path / "exr"):
         assert_refused(
             run("render", stream, output, "--camera", 0),
-            "at least one frame was expected, got none",
+            "expected at least one frame, got a header alone",
         )
         assert not output.exists()
 
