@@ -24,6 +24,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
+from morgs_mi.cli.accuracy import Accuracy
 from morgs_mi.cli.console import (
     ERR,
     STDOUT,
@@ -33,7 +34,6 @@ from morgs_mi.cli.console import (
     print_warning,
     sentence_of,
 )
-from morgs_mi.cli.accuracy import Accuracy
 from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
 from morgs_mi.cli.fit import Fit

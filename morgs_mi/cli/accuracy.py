@@ -10,8 +10,8 @@ from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.opening import DropInvalid, opened
 from morgs_mi.cli.settings import optional, place
+from morgs_mi.cli.streams import DropInvalid, opened
 
 
 @dataclass(frozen=True)

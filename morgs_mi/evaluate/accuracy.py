@@ -36,7 +36,6 @@ CHANGES = {
 } | {
     "block 4x4": {"block_width": 4, "block_height": 4},
     "block 8x8": {"block_width": 8, "block_height": 8},
-    "reproducible": {"reproducible": True},
 }
 
 
@@ -121,7 +120,7 @@ def accuracy(
 ) -> Accuracy:
     """Measure error and run time of the renderer along the settings that trade one for the other.
 
-    `alpha_min`, `stop_transmittance`, the shape of the blocks and `reproducible` vary; Gaussians
+    `alpha_min`, `stop_transmittance` and the shape of the blocks vary; Gaussians
     are sorted exactly with all of them. Errors are relative L2 norms of the colours of 512 random
     pixels and of gradients, against a float64 reference without both cut-offs. The loss has random
     weights at these pixels and zero weights elsewhere, so that the renderer runs unchanged. Where

@@ -169,8 +169,9 @@ def rasterize(
     sizes = {**channel_sizes(), "alpha": 1}
     view = cameras[0]
     if features is not None:
-        features = float_tensor("rasterize()", "features", features)
-        sizes["features"] = int(np.shape(features)[1])
+        rows = float_tensor("rasterize()", "features", features)
+        features = rows
+        sizes["features"] = int(rows.shape[1])
         channels = (*channels, "features")
     limits = None
     if depth_limit is not None:  # finite: a limit at infinity is one beyond all Gaussians

@@ -117,7 +117,6 @@ index: in {streams["damage"]:,} damaged streams and {streams["bytes"]:,} with ch
 method: Motion gains {parts["ml"] - parts["baseline"]:.2f} dB at 2 epochs
 method: additions to the paper gain {parts["ml-mo-mc"] - parts["paper"]:.2f} dB
 renderer: Blocks of 4x4 and 8x8 pixels take {small_blocks:.2f} and {large_blocks:.2f} of the time
-renderer: `reproducible` takes {ratios["reproducible"]:.2f}
 captures: {walk["psnr"]["first"]:.2f} dB in the first frame and {walk["psnr"]["last"]:.2f} dB in the
 captures: {walk["psnr_moving"]:.2f} dB where things move
 captures: A later frame takes {walk["seconds"]["per_later_frame"]:.1f} s
