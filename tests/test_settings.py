@@ -66,7 +66,7 @@ ELSEWHERE: dict[str, str] = {
     ),
     "fit.refine_cameras": "the recorder refines cameras: tests/studio/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
-    "fit.noise_aware": "images without noise here: tests/fit/test_dropping.py",
+    "fit.noise_aware": "images without noise here: tests/fit/test_dropout.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "motion.search": "flow explains all parts here: tests/method/test_search.py",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
+from morgs_mi import Camera, Gaussians, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, decode
@@ -34,7 +34,6 @@ from tests.scenes.textured import render, rig, textures
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
 QUICK = quick(  # from all points, as the images were made of them
     MotionConfig(key_views=2),
-    RenderConfig(),
     num_gaussians=600,
     first_frame_steps=150,
     dropout=0.0,

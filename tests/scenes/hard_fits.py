@@ -23,7 +23,7 @@ CONFIG = quick(
     MotionConfig(key_views=1),
     num_gaussians=200,
     first_frame_steps=100,
-    dropping=0.0,
+    dropout=0.0,
     density=NO_DENSITY,
 )
 RIG = tuple(look_at_cameras(QUAD, 50, 48, 36))

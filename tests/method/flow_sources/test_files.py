@@ -170,9 +170,7 @@ def test_flow_folder__rejects_missing_frames_and_other_sizes(
 
 def test_flow_folder__rejects_two_files_of_one_frame(folder):
     write_flow(folder / "cam00/backward/frame_1.exr", random_flow())
-    with pytest.raises(
-        ValueError, match=r"one file with the number 1, got frame_1 and v2_frame_0001"
-    ):
+    with pytest.raises(ValueError, match=r"one file of number 1, got frame_1 and v2_frame_0001"):
         FlowFolder(folder).flows("cam00", 1, (6, 9))
 
 

@@ -74,7 +74,7 @@ def test_render_inserted__honours_two_focal_lengths(stream, tmp_path):
     assert tall.shape == (view.height, view.width, 3)
     np.testing.assert_allclose(0.5 * (tall[::2] + tall[1::2]), square, atol=0.2)
     assert np.abs(0.5 * (tall[::2] + tall[1::2]) - square).mean() < 0.01
-    with pytest.raises(ValueError, match="`light` must be probe or traced, got 'lamp'"):
+    with pytest.raises(ValueError, match="`light` must be one of probe, traced, got 'lamp'"):
         InsertConfig(light="lamp")  # type: ignore[arg-type]
 
 
