@@ -94,17 +94,11 @@ def integrator(plugin: str, props: Any) -> Any:
 
     In a variant without derivatives, such as `scalar_rgb`, it refuses to render.
     """
-    if not dr.is_diff_v(mi.Float):
-        return _refusing_integrator(plugin, props)
-    return resolve_name(_PLUGINS[plugin])(props)
-
-
-def _refusing_integrator(plugin: str, props: Any) -> Any:
-    """Return an integrator whose `render` raises a ValueError.
-
-    Mitsuba would report an error of a constructor as a traceback inside another one.
-    """
+    if dr.is_diff_v(mi.Float):
+        return resolve_name(_PLUGINS[plugin])(props)
     variant = mi.variant()
+
+    # Mitsuba would report an error of a constructor as a traceback inside another one.
 
     class Refusal(mi.CppADIntegrator):
         def __init__(self, props: Any) -> None:

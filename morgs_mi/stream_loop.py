@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,6 @@ from morgs_mi.loop.input_images import Frame, as_array, in_order
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
-    RecordedViews,
     Setup,
     extended_history,
     observe_frame,
@@ -236,11 +236,12 @@ class StreamLoop:
         self._can_mistake_order = True
 
     @classmethod
-    def of(cls, capture: RecordedViews, config: StreamConfig | None = None) -> StreamLoop:
+    def of(cls, capture: Any, config: StreamConfig | None = None) -> StreamLoop:
         """Return the loop of the training views of a capture.
 
         Args:
-            capture: a `Capture`, or another value with its cameras, masks and points.
+            capture: a `Capture`, or another value with its cameras, train_views, masks, points,
+                point_colors and display_exposure.
             config: settings.
         """
         views = capture.train_views

@@ -49,16 +49,12 @@ class LearningRates:
         """Return the learning rate of every parameter of the attribute table by its name; `extent`
         in world units.
         """
-        rates = {}
-        for attribute in ATTRIBUTES:
-            if attribute.rate is not None:
-                rate = (
-                    getattr(self, attribute.rate)
-                    if isinstance(attribute.rate, str)
-                    else attribute.rate
-                )
-                rates[attribute.name] = rate * extent if attribute.rate_in_extents else rate
-        return rates
+        return {
+            a.name: (getattr(self, a.rate) if isinstance(a.rate, str) else a.rate)
+            * (extent if a.rate_in_extents else 1)
+            for a in ATTRIBUTES
+            if a.rate is not None
+        }
 
 
 @config_class

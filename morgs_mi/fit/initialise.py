@@ -9,8 +9,7 @@ from scipy.spatial import KDTree
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_points
-from morgs_mi.core.color_space import BRIGHTEST, SH_C0, unit_values
+from morgs_mi.core.color_space import SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, in_image, scene_extent, seen_points
 from morgs_mi.fit.view import View
@@ -44,11 +43,9 @@ def from_points(
         opacity: of every Gaussian.
 
     Raises:
-        ValueError: no points, points that are not finite, or colours of another shape or range.
+        ValueError: no points.
     """
-    points, colors = (
-        v.astype(np.float64) for v in check_points("from_points()", points, colors, BRIGHTEST)
-    )
+    points, colors = (v.astype(np.float64) for v in (points, colors))
     n = len(points)
     if not n:
         raise ValueError(
@@ -182,28 +179,23 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
     depths = focus_depths(cameras)
     depths[np.isinf(depths)] = _PARALLEL * scene_extent(cameras)
     pairs = [
-        pair
-        for pair in zip(views, depths, strict=True)
-        if pair[0].mask is None or pair[0].mask.any()
+        (view, depth)
+        for view, depth in zip(views, depths, strict=True)
+        if view.mask is None or view.mask.any()
     ]
-    parts = [
-        _view_points(view, depth, _share(count, index, len(pairs)), rng)
-        for index, (view, depth) in enumerate(pairs)
-    ]
-    return _concatenated([(np.zeros((0, 3)), np.zeros((0, 3))), *parts])
-
-
-def _view_points(view: View, depth: float, count: int, rng: np.random.Generator) -> Points:
-    """Return random points [count, 3] at valid pixels of a view, at random depths around one."""
-    camera, image, mask = view
-    distance = max(depth, 10 * camera.near)
-    rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
-    pixels = rng.integers(0, len(rows), count)
-    rows = rows[pixels]
-    columns = columns[pixels]
-    within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (count, 2))
-    points = camera.unproject(within, distance / rng.uniform(1 / 3, 3, count))
-    return points, unit_values(image[rows, columns])
+    parts = [(np.zeros((0, 3)), np.zeros((0, 3)))]
+    shares = np.array_split(np.arange(count), max(len(pairs), 1))
+    for (view, depth), share in zip(pairs, shares, strict=False):
+        camera, image, mask = view
+        distance = max(depth, 10 * camera.near)
+        rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
+        pixels = rng.integers(0, len(rows), len(share))
+        rows = rows[pixels]
+        columns = columns[pixels]
+        within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (len(share), 2))
+        points = camera.unproject(within, distance / rng.uniform(1 / 3, 3, len(share)))
+        parts.append((points, unit_values(image[rows, columns])))
+    return _concatenated(parts)
 
 
 def _concatenated(parts: Sequence[Points]) -> Points:
@@ -228,57 +220,28 @@ def fill_points(
         rng: draws pixels and depths.
     """
     parts = []
-    for index, view in enumerate(views):
+    for view, share in zip(views, np.array_split(np.arange(count), len(views)), strict=True):
         _, point_pixels, depths = seen_points(view.camera, points[0])
-        if len(point_pixels):
-            pixels = _free_pixels(view, point_pixels, _share(count, index, len(views)), rng)
-            depth = _depths_near(point_pixels, depths, pixels)
-            depth = depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
-            columns, rows = pixels.astype(int).T
-            colors = unit_values(view.image[rows, columns])
-            parts.append((view.camera.unproject(pixels, depth), colors))
+        if not len(point_pixels):
+            continue
+        size = (view.camera.width, view.camera.height)
+        pixels = rng.uniform(0, size, (len(share), 2))
+        point_cells, cells = ((p * _CELLS / size).astype(int) for p in (point_pixels, pixels))
+        is_free = np.ones((_CELLS, _CELLS), bool)
+        is_free[tuple(point_cells.T)] = False
+        chosen = is_free[tuple(cells.T)]
+        columns, rows = pixels.astype(int).T
+        if view.mask is not None:
+            chosen &= view.mask[rows, columns]
+        pixels = pixels[chosen]
+        # Weighted by the inverse distance, the depths of the nearest points are averaged as 1 / z.
+        k = min(_NEIGHBOURS, len(point_pixels))
+        nearest = KDTree(point_pixels).query(pixels, k=k)
+        distance, near = (np.reshape(values, (-1, k)) for values in nearest)
+        weights = 1 / (distance + 1e-3)
+        depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
+        depth = depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
+        colors = unit_values(view.image[rows[chosen], columns[chosen]])
+        parts.append((view.camera.unproject(pixels, depth), colors))
     num_new = sum(len(positions) for positions, _ in parts)
     return _concatenated([resample_points(points, count - num_new, rng), *parts])
-
-
-def _free_pixels(
-    view: View, point_pixels: np.ndarray, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Return valid pixel positions [n, 2] in cells without a point, out of `count` random ones;
-    `point_pixels` [P, 2] are the positions of the points.
-    """
-    camera = view.camera
-    pixels = rng.uniform(0, (camera.width, camera.height), (count, 2))
-    is_covered = np.zeros((_CELLS, _CELLS), bool)
-    is_covered[_cells_of(camera, point_pixels)] = True
-    is_free = ~is_covered[_cells_of(camera, pixels)]
-    if view.mask is not None:
-        columns, rows = pixels.astype(int).T
-        is_free &= view.mask[rows, columns]
-    return pixels[is_free]
-
-
-def _depths_near(point_pixels: np.ndarray, depths: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return the mean depths [n] of the points nearest to pixel positions [n, 2].
-
-    Args:
-        point_pixels: positions of the points in the image [P, 2].
-        depths: of the points [P].
-        pixels: n positions.
-    """
-    k = min(_NEIGHBOURS, len(point_pixels))
-    nearest = KDTree(point_pixels).query(pixels, k=k)
-    distance, near = (np.reshape(values, (-1, k)) for values in nearest)
-    weights = 1 / (distance + 1e-3)
-    return weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
-
-
-def _share(count: int, index: int, views: int) -> int:
-    """Return the number of points of one of the views, of `count` in all."""
-    return count // views + (index < count % views)
-
-
-def _cells_of(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row and the column of the cell of each pixel position [n, 2]."""
-    columns, rows = (pixels * _CELLS / (camera.width, camera.height)).astype(int).T
-    return rows, columns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +13,7 @@ from drjit.opt import Adam
 
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
+from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.render.kernel_recording import render_lock
 
 Losses = dict[str, Tensor]
@@ -84,21 +85,6 @@ def select_rows(
         replace_parameter(optimizer, name, value + edits[name] if name in edits else value, carry)
 
 
-class Observer(Protocol):
-    """Reads further gradients from the backward pass of every step, without a pass of its own.
-
-    In each step the losses are computed first, where an observer may render features; then its term
-    joins the loss, and the gradients are collected.
-    """
-
-    term: Tensor | None
-    """Term of value 0, which joins the losses of the step in its backward pass; None: no term."""
-
-    def collect(self) -> None:
-        """Read the gradients of the term, after the backward pass."""
-        ...
-
-
 @dataclass(frozen=True)
 class Steps:
     """Steps of an optimisation, one view each, and what is done beside them."""
@@ -107,7 +93,8 @@ class Steps:
     first_step: int = 0  #: Number of the first step.
     rate_factor: Callable[[int], float] | None = None  #: Step -> factor of all rates; None: 1.
     on_step: Callable[[int], None] | None = None  #: Called with the number of steps made.
-    observer: Observer | None = None  #: Observer of the backward passes.
+    #: Reads further gradients from the backward passes: its term joins the losses of each step.
+    observer: ErrorPerGaussian | None = None
     averaged_steps: int = 8  #: Number of last steps over which the losses are averaged.
 
 

@@ -5,7 +5,7 @@ starts from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import scene_depths, scene_extent
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import Points, from_points, initial_points
-from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.fit.view import View
 from morgs_mi.render.render_config import RenderConfig
 
 # Least scene extent, relative to the median depth: of means that move by fractions of the extent.
@@ -66,11 +66,3 @@ class FirstFrameProblem:
     def cameras(self) -> list[Camera]:
         """Cameras of the views."""
         return [view.camera for view in self.views]
-
-    def reduced(self, width: int) -> FirstFrameProblem:
-        """Return the problem with reduced views, see `View.reduced`."""
-        return replace(self, views=tuple(view.reduced(width) for view in self.views))
-
-    def psnr(self, gaussians: Gaussians) -> float:
-        """Return the mean PSNR of the views in dB, of their valid pixels."""
-        return mean_psnr(gaussians, self.views, self.render)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -32,40 +31,6 @@ from morgs_mi.method.objective import KeyView
 
 # Images of those views that have one, by view index.
 Images = Mapping[int, np.ndarray]
-
-
-class RecordedViews(Protocol):
-    """Cameras and points of a recording, as a `Capture` has them."""
-
-    @property
-    def cameras(self) -> Sequence[Camera]:
-        """All cameras."""
-        ...
-
-    @property
-    def masks(self) -> Sequence[np.ndarray | None]:
-        """Per camera [H, W] bool of valid pixels, or None."""
-        ...
-
-    @property
-    def train_views(self) -> Sequence[int]:
-        """Indices of the cameras that are trained on."""
-        ...
-
-    @property
-    def points(self) -> np.ndarray:
-        """Points [P, 3], world units."""
-        ...
-
-    @property
-    def display_exposure(self) -> float | None:
-        """Display exposure of images in linear light, stops; None: by the first frame."""
-        ...
-
-    @property
-    def point_colors(self) -> np.ndarray:
-        """Their colours [P, 3] in [0, 1]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +94,25 @@ def prepare(
     """Return the data that all frames share; arguments and errors as for `StreamLoop`."""
     config = StreamConfig() if config is None else config
     check_type("StreamLoop()", "config", config, StreamConfig)
-    _check_cameras(cameras)
+    if not isinstance(cameras, Sequence) or not cameras:
+        kind = f"a {type(cameras).__name__}" if cameras else "none"
+        raise ValueError(
+            f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a "
+            "list."
+        )
+    for camera in cameras:
+        check_type("StreamLoop()", "cameras", camera, Camera, OF_SENSOR)
     points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     masks = (None,) * len(cameras) if masks is None else masks
-    _check_masks(cameras, masks)
+    if len(masks) != len(cameras):
+        raise ValueError(
+            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "
+            f"got {len(masks)}; pass None where all pixels are valid."
+        )
+    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        if mask is not None:
+            place = f"StreamLoop(): view {camera.name or view!r}"
+            check_mask(place, mask, camera.height, camera.width)
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
     # An error now, not at the second frame, if a file that a method names is missing.
@@ -147,29 +127,6 @@ def prepare(
         check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
-
-
-def _check_cameras(cameras: Sequence[Camera]) -> None:
-    if not isinstance(cameras, Sequence) or not cameras:
-        kind = f"a {type(cameras).__name__}" if cameras else "none"
-        raise ValueError(
-            f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a "
-            "list."
-        )
-    for camera in cameras:
-        check_type("StreamLoop()", "cameras", camera, Camera, OF_SENSOR)
-
-
-def _check_masks(cameras: Sequence[Camera], masks: Sequence[np.ndarray | None]) -> None:
-    if len(masks) != len(cameras):
-        raise ValueError(
-            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "
-            f"got {len(masks)}; pass None where all pixels are valid."
-        )
-    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
-        if mask is not None:
-            place = f"StreamLoop(): view {camera.name or view!r}"
-            check_mask(place, mask, camera.height, camera.width)
 
 
 def views_of(setup: Setup, images: Images) -> list[View]:
@@ -222,18 +179,32 @@ def _extended(
     follow = setup.config.fit.exposure != "off"
     stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
     stops = display_stops(recorded.values()) if stops is None else stops
-    images = {v: display_image(image, stops) for v, image in recorded.items()}
+    display_images = {v: display_image(image, stops) for v, image in recorded.items()}
     kind = next((image.dtype.name for image in recorded.values()), history.kind)
     if not (skip or follow):
-        return ImageHistory(images, display_exposure=stops, kind=kind), None
-    exposures = _exposures(setup, history, images) if follow else {}
+        return ImageHistory(display_images, display_exposure=stops, kind=kind), None
+    views = sorted(display_images.keys() & history.references.keys())
+    exposures = {}
+    if follow:
+        # Relative to the views' first images, without the change of light that all views show.
+        view_exposures = map_in_threads(
+            lambda v: follow_exposure(
+                history.references[v], display_images[v], setup.masks[v], history.exposures.get(v)
+            ),
+            views,
+        )
+        light = common_change(view_exposures)
+        relative = [exposure.without(light) for exposure in view_exposures]
+        # The identity where an exposure hardly changes an image.
+        visible = [e if e.change > LEAST_CHANGE else Exposure() for e in relative]
+        exposures = {**history.exposures, **dict(zip(views, visible, strict=True))}
     images = {
-        v: exposures[v].corrected(image) if v in exposures else image for v, image in images.items()
+        v: exposures[v].corrected(image) if v in exposures else image
+        for v, image in display_images.items()
     }
     # A view's first image has no changes.
     changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}
     references = {**history.references, **images}
-    views = sorted(images.keys() & history.references.keys())
     config = setup.config.motion.change
     masks = map_in_threads(
         lambda v: change_mask(history.references[v], images[v], setup.masks[v], config), views
@@ -245,24 +216,6 @@ def _extended(
         old = history.references[v].copy()
         references[v] = np.asarray(cv2.copyTo(images[v], mask.astype(np.uint8), old))
     return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
-
-
-def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[int, Exposure]:
-    """Return the exposures relative to the views' first images, without the change of light that
-    all views show.
-    """
-    views = sorted(recorded.keys() & history.references.keys())
-    view_exposures = map_in_threads(
-        lambda v: follow_exposure(
-            history.references[v], recorded[v], setup.masks[v], history.exposures.get(v)
-        ),
-        views,
-    )
-    light = common_change(view_exposures)
-    exposures = [exposure.without(light) for exposure in view_exposures]
-    # The identity where an exposure hardly changes an image.
-    visible = [e if e.change > LEAST_CHANGE else Exposure() for e in exposures]
-    return {**history.exposures, **dict(zip(views, visible, strict=True))}
 
 
 def _flows(

@@ -167,8 +167,8 @@ def find_active_set(
     for view in changed_views.values():
         active |= _inside_unexplained(view, active)
     # Those that hardly change are drawn in some views only.
-    indices = list(cameras)
-    quiet_views = choose_key_views(list(cameras.values()), config.quiet_views)
+    indices = [*cameras]
+    quiet_views = choose_key_views([*cameras.values()], config.quiet_views)
     some = {indices[k] for k in quiet_views}
     drawn = {v: active if v in some else active & (shares > QUIET) for v in cameras}
     blocks_by_view = {

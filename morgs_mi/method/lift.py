@@ -129,19 +129,14 @@ def lift_flow(
         jacobian = view.camera.projection_jacobian(means)
         floor = motion_floor(view.camera.width, masks)
         view_motions.append(_LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor))
-    d = _robust_displacement(view_motions, len(means))
+    d = _solve(view_motions, [np.ones(len(means))] * len(view_motions))
+    for _ in range(_ROUNDS):  # iteratively reweighted least squares
+        trust = [np.exp(-view.cost(d, view.project(d))) for view in view_motions]
+        d = _solve(view_motions, trust)
     logit = _logits(view_motions, d)
     return MotionStart(
         np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
     )
-
-
-def _robust_displacement(views: list[_LiftView], N: int) -> np.ndarray:
-    """Return d [N, 3] by iteratively reweighted least squares."""
-    d = _solve(views, [np.ones(N)] * len(views))
-    for _ in range(_ROUNDS):
-        d = _solve(views, [np.exp(-view.cost(d, view.project(d))) for view in views])
-    return d
 
 
 def _logits(views: list[_LiftView], d: np.ndarray) -> np.ndarray:

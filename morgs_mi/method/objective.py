@@ -103,7 +103,6 @@ class Term:
     """One term of the objective."""
 
     name: str  #: In reports.
-    weight: Callable[[ObjectiveConfig], float]  #: Lambda, by the settings.
     loss: Loss  #: (prediction, observations, settings) -> scalar.
     channels: tuple[str, ...] = ()  #: That must be rendered.
     observations: tuple[str, ...] = ()  #: That must exist.
@@ -111,19 +110,18 @@ class Term:
     #: (key view, settings of the motion, settings) -> observations [H, W, ...] by name; None: they
     #: exist without it.
     observer: Observer | None = None
+    weight: float | None = None  #: Lambda; None: the setting NAME_weight, 1 without one.
 
 
 TERMS: tuple[Term, ...] = (
     Term(  # eq. 2
         "recon",
-        lambda config: 1.0,
         lambda p, o, config: recon_loss(p.image.color, o["target"], config.dssim_weight, p.region),
         channels=("color",),
         observations=("target",),
     ),
     Term(  # eq. 7
         "flow",
-        lambda config: config.flow_weight,
         lambda p, o, config: flow_loss(
             p.image["guided_motion"], o["motion"], o["reliable"], p.num_pixels
         ),
@@ -137,7 +135,6 @@ TERMS: tuple[Term, ...] = (
     ),
     Term(  # eq. 11
         "mask",
-        lambda config: config.mask_weight,
         lambda p, o, config: mask_loss(p.image.confidence, o["mask"], p.num_pixels),
         channels=("confidence",),
         observations=("mask",),
@@ -149,14 +146,12 @@ TERMS: tuple[Term, ...] = (
     ),
     Term(  # L_off
         "offset",
-        lambda config: config.offset_weight,
         lambda p, o, config: offset_loss(p.parameters["offset"], p.extent, p.num_gaussians),
         parameters=("offset",),
     ),
     *(
         Term(  # not in the paper, see `rigidity`
             name,
-            lambda config, name=name: getattr(config, f"{name}_weight"),
             lambda p, o, config, loss=loss: loss(p.gaussians, o["neighbours"]),
             observations=("neighbours",),
         )
@@ -208,9 +203,7 @@ def loss_term(
 
     def add(loss: Loss) -> Loss:
         def term(weight: str, config: ObjectiveConfig) -> Term:
-            return Term(
-                name, lambda _: _weight(weight), loss, channels, observations, parameters, observer
-            )
+            return Term(name, loss, channels, observations, parameters, observer, _weight(weight))
 
         LOSS_TERMS.register(name, "WEIGHT")(term)
         return loss
@@ -252,10 +245,11 @@ def active_terms(
     observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig
 ) -> list[Term]:
     """Return the terms that act in a view with these observations."""
+    weights = weights_of(config)
     return [
         term
         for term in terms_of(config)
-        if term.weight(config)
+        if weights[term.name]
         and observations.keys() >= {*term.observations}
         and all(name in parameters for name in term.parameters)
     ]
@@ -277,4 +271,9 @@ def losses_of(
 
 def weights_of(config: ObjectiveConfig) -> dict[str, float]:
     """Return the weights of the terms, by name."""
-    return {term.name: term.weight(config) for term in terms_of(config)}
+    return {
+        term.name: getattr(config, f"{term.name}_weight", 1.0)
+        if term.weight is None
+        else term.weight
+        for term in terms_of(config)
+    }

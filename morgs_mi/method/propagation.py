@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.sweep import relative_error
 
@@ -43,7 +43,12 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """
     d = start.displacement  # [N, 3]
     logit = start.logit_confidence
-    last_motion = _previous_motion(problem.gaussians)
+    # Into the previous frame, of those that moved then with confidence.
+    gaussians = problem.gaussians
+    last_motion = np.zeros_like(d) if gaussians.motion is None else np.asarray(gaussians.motion)
+    if gaussians.logit_confidence is not None:
+        confident = np.asarray(gaussians.logit_confidence)[:, None] > 0
+        last_motion = np.where(confident, last_motion, 0)
     if not problem.views or not (d.any() or last_motion.any()):
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
@@ -75,15 +80,3 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         accepted = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
         logit = np.where(is_better, accepted, logit)
     return MotionStart(d, logit.astype(np.float32))
-
-
-def _previous_motion(gaussians: Gaussians) -> np.ndarray:
-    """Return the motion [N, 3] into the previous frame of those that moved then with confidence, 0
-    for the others.
-    """
-    if gaussians.motion is None:
-        return np.zeros((len(gaussians), 3), np.float32)
-    motion = np.asarray(gaussians.motion)
-    if gaussians.logit_confidence is None:
-        return motion
-    return np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, motion, 0)

@@ -37,24 +37,16 @@ def residual_parameters(
     """Return the parameters of one frame's residual at their start.
 
     Args:
-        previous: N Gaussians of the previous frame.
+        previous: N Gaussians of the previous frame, with a confidence if it is learned.
         config: which modules are on.
         start: of motion, confidence and colour; None: all as in the previous frame, without motion.
-
-    Raises:
-        ValueError: the confidence is learned, and the Gaussians have none.
     """
     shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
     names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
     parameters = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
     gate: np.ndarray | float = 1.0
     if config.learn_confidence:
-        logit = previous.logit_confidence
-        if logit is None:
-            raise ValueError(
-                "residual_parameters(): `previous` must have a confidence with "
-                "`learn_confidence`, got none; set `logit_confidence`, or switch the module off."
-            )
+        logit: Tensor = previous.logit_confidence
         if start is not None and config.lift_confidence:
             logit = from_numpy(mi.TensorXf, start.logit_confidence)
         # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.

@@ -66,12 +66,15 @@ def find_neighbours(
     first = _selection(np.repeat(np.arange(N), k), N)
     edges = (means[near] - means[:, None]).reshape(-1, 3) / extent
     weights = np.exp(-np.sum(edges**2, axis=1) / reach**2) / len(edges)
+    quats = np.asarray(gaussians.quats)
+    squares = np.maximum(np.sum(quats**2, axis=1, keepdims=True), 1e-30)
+    inverse = quats * (1, -1, -1, -1) / squares
     return Neighbours(
         first,
         csr_array(_selection(near.ravel(), N) - first),
         from_numpy(mi.Float, weights),
         mi.Vector3f(*(from_numpy(mi.Float, x) for x in edges.T)),
-        _inverse_quats(np.asarray(gaussians.quats)),
+        mi.Vector4f(*(from_numpy(mi.Float, x) for x in inverse.T)),
         extent,
     )
 
@@ -80,12 +83,6 @@ def _selection(indices: np.ndarray, N: int) -> csr_array:
     """Return the matrix [E, N] that selects the values of the Gaussians at `indices` [E]."""
     ones = np.ones(len(indices), np.float32)
     return csr_array((ones, (np.arange(len(indices)), indices)), (len(indices), N))
-
-
-def _inverse_quats(quats: np.ndarray) -> Jit:
-    """Return the inverses of quaternions [N, 4] of any length, as a Dr.Jit vector [4, N]."""
-    inverse = quats * (1, -1, -1, -1) / np.maximum(np.sum(quats**2, axis=1, keepdims=True), 1e-30)
-    return mi.Vector4f(*(from_numpy(mi.Float, x) for x in inverse.T))
 
 
 def rigid_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:

@@ -89,19 +89,11 @@ def make_active_view(
         config: cut-offs and block shape.
     """
     names = tuple(name for name in channels if name != "alpha")
-    if not int(static.means.shape[0]):
-        return ActiveView(camera, config, region)
-    with dr.suspend_grad():
-        rows = dr.compress(touches(project(static, camera, (), config), region))
-        if not dr.width(rows):
-            return ActiveView(camera, config, region)
-        static_splats = project(static, camera, names, config, rows)
-        dr.eval(
-            static_splats.shape,
-            static_splats.channels,
-            static_splats.depths,
-            static_splats.extent,
-            static_splats.valid,
-            static_splats.finite,
-        )
+    static_splats = None
+    if int(static.means.shape[0]):
+        with dr.suspend_grad():
+            rows = dr.compress(touches(project(static, camera, (), config), region))
+            if dr.width(rows):
+                static_splats = project(static, camera, names, config, rows)
+                dr.eval(vars(static_splats))
     return ActiveView(camera, config, region, static_splats)

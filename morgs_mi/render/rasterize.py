@@ -69,8 +69,7 @@ class Image:
         Raises:
             KeyError: the image was rendered without that channel.
         """
-        values = {**vars(self), **self.others}
-        del values["others"]
+        values = {**vars(self), "others": None, **self.others}
         tensors = {name: value for name, value in values.items() if value is not None}
         if channel not in tensors:
             raise KeyError(
@@ -185,16 +184,20 @@ def rasterize(
         return _empty(channels, sizes, background, region, stack)
     cut = limits is not None
     projected = (*blended, "profile") if cut else blended
+    rows = None
+    if not region.whole and static_splats is None:  # those that touch no block are not blended
+        with dr.suspend_grad():
+            bare = project(dr.detach(gaussians), view, (), config)
+            visible = touches(bare, region)
+            dr.schedule(visible)
+            _check_finite(bare.finite, gaussians, cameras, features)
+            rows = dr.compress(visible)
+        if not dr.width(rows):
+            return _empty(channels, sizes, background, region, stack)
+    parts = [project(gaussians, part, projected, config, rows, features) for part in cameras]
+    splats = parts[0] if len(parts) == 1 else _stacked(parts)
     if static_splats is not None:
-        splats = project(gaussians, view, projected, config, features=features).concatenated_with(
-            static_splats
-        )
-    elif region.whole:
-        splats = _project_views(gaussians, cameras, projected, features, config)
-    else:
-        splats = _project_region(gaussians, view, projected, region, features, config)
-    if splats is None:
-        return _empty(channels, sizes, background, region, stack)
+        splats = splats.concatenated_with(static_splats)
     dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
     _check_finite(splats.finite, gaussians, cameras, features)
     values = [splats.channels[name] for name in blended]
@@ -250,50 +253,15 @@ def _over(background: Sequence[float] | Jit | None, values: Float, weight: Float
     )
 
 
-def _project_views(
-    gaussians: ActivatedGaussians,
-    cameras: Sequence[Camera],
-    channels: tuple[str, ...],
-    features: Tensor | None,
-    config: RenderConfig,
-) -> Splats:
-    """Project the Gaussians into every view, one by one, so that the views share a kernel."""
-    parts = [project(gaussians, camera, channels, config, features=features) for camera in cameras]
-    if len(parts) == 1:
-        return parts[0]
+def _stacked(parts: list[Splats]) -> Splats:
+    """Return the splats of all views, which were projected one by one to share a kernel."""
     for v, part in enumerate(parts):
         parts[v] = replace(part, view=dr.full(mi.UInt32, v, len(part)))
-        dr.eval(
-            part.geometry,
-            part.channels,
-            part.depths,
-            part.extent,
-            part.valid,
-            part.finite,
-            parts[v].view,
-        )
+        dr.eval(vars(parts[v]))
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [a.concatenated_with(b) for a, b in pairs] + parts[len(parts) & ~1 :]
     return parts[0]
-
-
-def _project_region(
-    gaussians: ActivatedGaussians,
-    camera: Camera,
-    channels: tuple[str, ...],
-    region: Region,
-    features: Tensor | None,
-    config: RenderConfig,
-) -> Splats | None:
-    """Project the Gaussians that touch the region; None if there are none."""
-    with dr.suspend_grad():
-        bare = project(dr.detach(gaussians), camera, (), config)
-        visible = touches(bare, region)
-        dr.schedule(visible)
-        _check_finite(bare.finite, gaussians, (camera,), features)
-        rows = dr.compress(visible)
-    return project(gaussians, camera, channels, config, rows, features) if dr.width(rows) else None
 
 
 def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:

@@ -195,26 +195,7 @@ def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarr
 
     Returns:
         float32 [N, C].
-
-    Raises:
-        ValueError: the size of the image does not match the view.
     """
     group = ViewGroup([view])
-    if view.region is None:
-        C = _num_channels(image, (view.camera.height, view.camera.width))
-        blocks = group.crop([image])
-    else:
-        C = _num_channels(image, group.region.shape(0)[:-1])
-        blocks = image
-    return group.draw(gaussians).sums(from_numpy(mi.Float, blocks), C)[0]
-
-
-def _num_channels(image: np.ndarray, size: tuple[int, ...]) -> int:
-    """Return C of an image [*size, C] to project back."""
-    C = (np.shape(image) or (0,))[-1]
-    if not C or image.shape != (*size, C):
-        raise ValueError(
-            f"backproject(): `image` must be [{', '.join(map(str, size))}, C] with C > 0, got "
-            f"{list(np.shape(image))}; resize it to the camera, or crop it to the region."
-        )
-    return C
+    blocks = group.crop([image]) if view.region is None else image
+    return group.draw(gaussians).sums(from_numpy(mi.Float, blocks), image.shape[-1])[0]

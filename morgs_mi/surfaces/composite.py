@@ -55,7 +55,7 @@ def composite(
         view: the surfaces on P pixels of a camera's image.
         config: settings of the rasteriser.
     """
-    encode, decode = (encode_traced, decode_traced) if view.srgb else (_unchanged, _unchanged)
+    encode, decode = (encode_traced, decode_traced) if view.srgb else (lambda v: v,) * 2
     channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
     image = rasterize(gaussians, view.pixels.camera, channels, config=config)
     crop = view.pixels.crop
@@ -165,7 +165,3 @@ def cropped(image: Tensor, crop: Crop) -> list[Float]:
 
 def _ratio(sums: list[Float], weight: Float) -> list[Float]:
     return [dr.select(weight > 0, value / dr.maximum(weight, 1e-8), 0) for value in sums]
-
-
-def _unchanged(values: Float) -> Float:
-    return values

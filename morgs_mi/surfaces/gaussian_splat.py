@@ -164,11 +164,11 @@ class _ForwardPass(NamedTuple):
         """Return whether the inputs are the same numbers and the same Dr.Jit variables as those of
         the image.
         """
-        return [_identity(leaf) for leaf in inputs] == [_identity(leaf) for leaf in self.inputs]
-
-
-def _identity(leaf: Any) -> Any:
-    return (leaf.index, leaf.index_ad) if dr.is_jit_v(leaf) else leaf
+        numbers, own_numbers = (
+            [(leaf.index, leaf.index_ad) if dr.is_jit_v(leaf) else leaf for leaf in leaves]
+            for leaves in (inputs, self.inputs)
+        )
+        return numbers == own_numbers
 
 
 def _leaves(value: Any) -> list[Any]:
@@ -458,24 +458,24 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def _warn(self, scene: Any, gaussians: _SceneGaussians) -> None:
         """Log what the image leaves out, once."""
+        sentences = []
         if scene.emitters() and self.surfaces is None:
-            self._warn_once(
+            sentences.append(
                 "gaussian_splat ignores the scene's emitters; set its `background` colour instead."
             )
         opacities = dr.detach(gaussians.opacities.array)
         outside: Any = dr.count((opacities < 0) | (opacities > 1))
         if count := int(outside[0]):
-            self._warn_once(
+            sentences.append(
                 f"gaussian_splat: `opacities` must be in [0, 1], got {count} values outside: "
                 "those below 0 are not drawn and get no gradient, those above 1 are cut off at "
                 "full coverage; clamp them after each step."
             )
-
-    def _warn_once(self, sentence: str) -> None:
-        key = sentence.partition(",")[0]
-        if key not in self.warnings:
-            _log.warning(sentence)
-            self.warnings.add(key)
+        for sentence in sentences:
+            key = sentence.partition(",")[0]
+            if key not in self.warnings:
+                _log.warning(sentence)
+                self.warnings.add(key)
 
     def to_string(self) -> str:
         return (

@@ -67,7 +67,9 @@ class _Tree:
         # An empty box is a point at infinity, which no ray reaches.
         rows[:, :3] = low
         rows[:, 4:7] = np.where(low > high, np.inf, high)
-        return _Tree(_opaque(depth), tuple(map(_opaque, flips)), from_numpy(mi.Float, rows)), order
+        # No literals, with which every scene would compile its own kernel.
+        levels, x, y, z = (dr.opaque(mi.UInt32, value) for value in (depth, *flips))
+        return _Tree(levels, (x, y, z), from_numpy(mi.Float, rows)), order
 
     def walk(
         self,
@@ -131,7 +133,11 @@ def _leaf_order(centers: np.ndarray, depth: int) -> tuple[np.ndarray, list[int]]
     places = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
     for level in range(depth):
         order = order.reshape(1 << level, -1)
-        axis = _longest_axis(places[order])
+        groups = places[order]
+        finite = np.isfinite(groups)  # those with a box
+        high = np.where(finite, groups, -np.inf).max(1)
+        extent = high - np.where(finite, groups, np.inf).min(1)
+        axis = int(np.where(finite.any(1), extent, 0).mean(0).argmax())  # the longest on average
         flips[axis] |= 1 << (depth - 1 - level)
         partition = places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1)
         order = np.take_along_axis(order, partition, axis=1)
@@ -340,15 +346,6 @@ def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
     return values
 
 
-def _longest_axis(points: np.ndarray) -> int:
-    """Return the axis along which groups of points [G, M, 3] extend most; points at infinity are
-    left out.
-    """
-    finite = np.isfinite(points)
-    extent = np.where(finite, points, -np.inf).max(1) - np.where(finite, points, np.inf).min(1)
-    return int(np.where(finite.any(1), extent, 0).mean(0).argmax())
-
-
 def _before(depth: Float, row: UInt32, other: Float, other_row: UInt32) -> Bool:
     """Return whether a Gaussian is blended before another one; equal depths are ordered by row."""
     return (depth < other) | ((depth == other) & (row < other_row))
@@ -357,10 +354,3 @@ def _before(depth: Float, row: UInt32, other: Float, other_row: UInt32) -> Bool:
 def _phi(q: Float) -> Float:
     """Return the distribution function of the normal distribution."""
     return dr.fma(0.5, dr.erf(q * sqrt(0.5)), 0.5)
-
-
-def _opaque(value: int) -> UInt32:
-    """Return a number that is not a literal of the kernel, which would otherwise be compiled for
-    every scene.
-    """
-    return dr.opaque(mi.UInt32, value)

@@ -133,12 +133,8 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
     tables: list[Any] = [mi.traverse(shape) for shape in shapes]
-    attached = [
-        (params, key, params[key])
-        for params in tables
-        for key in params.keys()  # noqa: SIM118
-        if dr.grad_enabled(params[key])
-    ]
+    pairs = zip(shapes, tables, strict=True)
+    attached = [(params, key, params[key]) for shape, params in pairs for key in _attached(shape)]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.checks import check_number, check_points
-from morgs_mi.fit.initialise import from_points
 from tests.scenes.recording import recording
 
 
@@ -42,11 +41,5 @@ def test_check_points__colours_out_of_range_are_refused_where_they_enter(unit):
     points = np.zeros((4, 3))
     colors = np.zeros((4, 3))
     colors[2, 1] = unit
-    for enter in (
-        from_points,
-        lambda *rows, sh_degree: recording(points=rows[0], point_colors=rows[1]),
-    ):
-        with pytest.raises(
-            ValueError, match=r"`point_colors` must be in \[0, (1|32)\], got .* at 2"
-        ):
-            enter(points, colors, sh_degree=0)
+    with pytest.raises(ValueError, match=r"`point_colors` must be in \[0, 1\], got .* at 2"):
+        recording(points=points, point_colors=colors)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -108,11 +106,3 @@ def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
     )
     expected = m * (1 - m) * R.sum(1)
     assert_close(dr.grad(parameters["logit_confidence"]), expected, atol=1e-6)
-
-
-def test_residual_parameters__refuse_gaussians_without_confidence():
-    previous = replace(to_gaussians(make_scene()), logit_confidence=None)
-    with pytest.raises(
-        ValueError, match="`previous` must have a confidence with `learn_confidence`, got none"
-    ):
-        residual_parameters(previous, MotionConfig())

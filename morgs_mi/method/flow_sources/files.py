@@ -77,32 +77,31 @@ class FlowFolder:
         """
         flows = []
         for direction, number in (("backward", frame), ("forward", frame - 1)):
-            path = self._find(self.folder / camera / direction, number)
-            flow = read_flow(path)
+            folder = self.folder / camera / direction
+            if number not in self._listed.get(folder, {}):  # files may have been added since
+                content = listed(folder) if folder.is_dir() else ()
+                paths = [path for path in content if path.suffix.lower() in SUFFIXES]
+                numbers = frame_numbers(folder, [path.stem for path in paths]) if paths else ()
+                self._listed[folder] = dict(zip(numbers, paths, strict=True))
+            files = self._listed[folder]
+            if number not in files:
+                content = (
+                    f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
+                )
+                raise FileNotFoundError(
+                    f"{folder}: expected a .flo or .exr file of frame {number}, found {content}; "
+                    "name each file after the frame on whose grid its flow lives, counting from 0."
+                )
+            flow = read_flow(files[number])
             if flow.shape[:2] != size:
                 rows, columns = flow.shape[:2]
-                height, width = size
                 raise ValueError(
-                    f"{path}: expected {width}x{height} pixels as the images of {camera} have, got "
-                    f"{columns}x{rows}; compute the flow on undistorted and downscaled images."
+                    f"{files[number]}: expected {size[1]}x{size[0]} pixels as the images of "
+                    f"{camera} have, got {columns}x{rows}; compute the flow on undistorted and "
+                    "downscaled images."
                 )
             flows.append(flow)
         return flows[0], flows[1]
-
-    def _find(self, folder: Path, frame: int) -> Path:
-        if frame not in self._listed.get(folder, {}):  # files may have been added since
-            content = listed(folder) if folder.is_dir() else ()
-            files = [path for path in content if path.suffix.lower() in SUFFIXES]
-            numbers = frame_numbers(folder, [path.stem for path in files]) if files else ()
-            self._listed[folder] = dict(zip(numbers, files, strict=True))
-        files = self._listed[folder]
-        if frame not in files:
-            content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
-            raise FileNotFoundError(
-                f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name "
-                "each file after the frame on whose grid its flow lives, counting from 0."
-            )
-        return files[frame]
 
 
 def read_flow(path: str | Path) -> np.ndarray:

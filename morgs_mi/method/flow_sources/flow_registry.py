@@ -78,7 +78,6 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
     """
 
     def source(pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
-        check_images("FlowSource()", pair.image, pair.previous)
         box = pair.box or np.s_[:, :]
         image, previous = (np.ascontiguousarray(v[box]) for v in (pair.image, pair.previous))
         backward, forward = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
@@ -87,18 +86,3 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
         return backward, forward
 
     return source
-
-
-def check_images(place: str, image: np.ndarray, previous: np.ndarray) -> None:
-    """Raise ValueError unless both images are RGB of one size [H, W, 3].
-
-    Args:
-        place: the public function that the error names.
-        image: the first image.
-        previous: the second image.
-    """
-    if image.ndim != 3 or image.shape[2] != 3 or image.shape != previous.shape:
-        raise ValueError(
-            f"{place}: `image` and `previous` must be RGB of one size [H, W, 3], got "
-            f"{image.shape} and {previous.shape}."
-        )

@@ -19,7 +19,6 @@ from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
     FlowConfig,
     both_directions,
-    check_images,
 )
 
 # Side of an image in pixels below which the methods have too little to match: DIS needs patches of
@@ -101,18 +100,8 @@ def optical_flow(
         previous: I_{t-1}, likewise.
         method: a key of `FLOW_METHODS`.
         config: settings of the methods; None: the defaults.
-
-    Raises:
-        ValueError: an unknown method, images that are not RGB or differ in size.
     """
-    if method not in FLOW_METHODS:
-        raise ValueError(
-            f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}."
-        )
     config = config or FlowConfig()
-    image = np.asarray(image)
-    previous = np.asarray(previous)
-    check_images("optical_flow()", image, previous)
     if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
     a, b = (np.ascontiguousarray(byte_values(each)) for each in (image, previous))

@@ -52,6 +52,4 @@ MASK_REFINERS: Registry[MaskRefiner, MaskConfig] = Registry(
 """Refiners by name, e.g. ``grabcut`` (see `opencv_masks`)."""
 
 
-@MASK_REFINERS.register("none")
-def _none(argument: str, config: MaskConfig) -> MaskRefiner:
-    return lambda image, mask: mask
+MASK_REFINERS.register("none")(lambda argument, config: lambda image, mask: mask)

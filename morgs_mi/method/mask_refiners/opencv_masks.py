@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig, MaskRefiner
+from morgs_mi.method.exposure import thumbnail
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 
 # Radius in pixels of the opening that removes specks.
 _OPENING = 1
@@ -42,7 +43,7 @@ def refine_mask(
     """
     config = config or MaskConfig()
     clean = clean_mask(mask)
-    small = _reduced(image, config.working_width)
+    small = thumbnail(byte_values(image), config.working_width)
     seed = cv2.resize(clean.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     near = cv2.dilate(seed, _disc(int(max(seed.shape) * _REACH)))
     if not seed.any() or near.all() or seed.mean() > _COVERAGE:
@@ -78,7 +79,7 @@ def vote_superpixels(
         config: settings of the superpixels; None: the defaults.
     """
     config = config or MaskConfig()
-    small = _reduced(image, config.working_width)
+    small = thumbnail(byte_values(image), config.working_width)
     if min(small.shape[:2]) < 2 * _SIDE:
         return mask
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
@@ -103,24 +104,14 @@ def clean_mask(mask: np.ndarray) -> np.ndarray:
     )
 
 
-@MASK_REFINERS.register("grabcut")
-def _grabcut(argument: str, config: MaskConfig) -> MaskRefiner:
-    return lambda image, mask: mask | refine_mask(image, mask, config)
-
-
-@MASK_REFINERS.register("superpixels+grabcut")
-def _both(argument: str, config: MaskConfig) -> MaskRefiner:
-    return lambda image, mask: (
-        vote_superpixels(image, mask, config) | refine_mask(image, mask, config)
+MASK_REFINERS.register("grabcut")(
+    lambda argument, config: lambda image, mask: mask | refine_mask(image, mask, config)
+)
+MASK_REFINERS.register("superpixels+grabcut")(
+    lambda argument, config: (
+        lambda image, mask: vote_superpixels(image, mask, config) | refine_mask(image, mask, config)
     )
-
-
-def _reduced(image: np.ndarray, widest: int) -> np.ndarray:
-    """Return an image as bytes, no wider than `widest` pixels."""
-    height, width = image.shape[:2]
-    scale = min(1.0, widest / width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return cv2.resize(byte_values(image), size, interpolation=cv2.INTER_AREA)
+)
 
 
 def _enlarged(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

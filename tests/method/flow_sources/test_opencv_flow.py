@@ -73,22 +73,6 @@ def test_optical_flow__is_finite_with_nothing_to_match(method):
     assert np.abs(optical_flow(image, image, method)).max() < 0.1
 
 
-RGB = np.zeros((20, 20, 3), np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((RGB, RGB, "raft"), "dis-fine.*got 'raft'"),
-        ((RGB, RGB[:18]), "one size"),
-        ((RGB[..., 0], RGB[..., 0]), r"RGB .* \(20, 20\)"),
-    ],
-)
-def test_optical_flow__rejects_bad_input(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        optical_flow(*arguments)
-
-
 def test_flow_source__passes_its_config_to_the_method():
     previous, image, _ = moving_disc(144, 200, shift=(6, 1))
     flow, changed = (
