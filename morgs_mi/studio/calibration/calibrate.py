@@ -37,7 +37,7 @@ from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import open_clips
-from morgs_mi.studio.calibration.checks.mistakes import same_poses
+from morgs_mi.studio.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
 from morgs_mi.studio.calibration.colmap_library import import_pycolmap
 
@@ -213,11 +213,11 @@ def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     ]
     cameras = [Camera(np.eye(3), pose, 1, 1) for pose in poses]  # with any intrinsics
     posed_names = [*images]
-    for i, j in same_poses(cameras):
-        for view, twin in ((i, j), (j, i)):
+    for i, j in duplicate_poses(cameras):
+        for view, other in ((i, j), (j, i)):
             name = posed_names[view]
             advice = (
-                f"it has the same pose as {posed_names[twin]}: one clip seems to be a copy of the "
+                f"it has the same pose as {posed_names[other]}: one clip seems to be a copy of the "
                 "other; replace it"
             )
             checks[name] = replace(checks[name], fits=False, advice=advice)

@@ -59,7 +59,7 @@ _FACTOR_STEP = 0.25
 _LEAST_FACTOR = 0.1
 
 
-def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Return the pairs of cameras with the same pose."""
     positions = np.array([camera.position for camera in cameras])
     rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])

@@ -24,7 +24,7 @@ from morgs_mi.studio.calibration.checks.mistakes import (
     camera_candidates,
     focal_candidates,
     rig_candidates,
-    same_poses,
+    duplicate_poses,
     with_focal_factor,
 )
 
@@ -155,7 +155,7 @@ def _checks_of_mistake(pairs: _Pairs, corrected: Sequence[Camera]) -> list[Camer
 def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
     """Return the results with the reasons for cameras with the pose or the clip of another one."""
     pose_reasons: dict[int, str] = {}
-    for pair in same_poses(pairs.cameras):
+    for pair in duplicate_poses(pairs.cameras):
         # If one of the two fits, the pose is its own.
         for view in [view for view in pair if not checks[view].fits] or pair:
             pose_reasons.setdefault(
