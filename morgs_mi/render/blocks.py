@@ -7,7 +7,8 @@ entries by 32 blocks of bits are transposed in registers: every block has its ow
 over its tile's list. The blending loops walk the set bits. A block's list is never written out, and
 a pair of Gaussian and block costs one bit.
 
-The *rank* of a Gaussian is its place in depth order. Equal depths are in the order of the input.
+The *depth order* of a Gaussian is its place among all by depth. Equal depths are in the order of
+the input.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _TEST_SLACK = 1e-3
 class BlockLists:
     """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile."""
 
-    #: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
+    #: (geometry, blended columns) by depth order, see `Splats.geometry` and `pack_records`.
     records: Float
     #: Bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
     words: UInt32
@@ -43,8 +44,8 @@ class BlockLists:
     first: UInt32  #: First entry of its tile [A].
     count: UInt32  #: Number of set bits of each block [A].
     order: UInt32  #: Blocks by falling count, roughly [A]: the lanes of a packet finish together.
-    rank_of: UInt32  #: Rank of each splat [N].
-    by_rank: UInt32  #: Splat of each rank [N].
+    depth_order_of: UInt32  #: Of each splat [N].
+    by_depth_order: UInt32  #: Splats by depth order [N].
 
 
 def build_lists(
@@ -66,14 +67,14 @@ def build_lists(
     """
     N = len(splats)
     depths = dr.select(splats.valid, splats.depths, dr.inf)
-    by_rank = dr.argsort(depths)
-    rank_of = dr.empty(mi.UInt32, N)
-    dr.scatter(rank_of, dr.arange(mi.UInt32, N), by_rank, mode=dr.ReduceMode.Permute)
+    by_depth_order = dr.argsort(depths)
+    depth_order_of = dr.empty(mi.UInt32, N)
+    dr.scatter(depth_order_of, dr.arange(mi.UInt32, N), by_depth_order, mode=dr.ReduceMode.Permute)
     rectangles = _tile_rectangles(splats, region)
     dr.eval(rectangles)
-    tiles = _tile_lists([dr.gather(mi.UInt32, v, by_rank) for v in rectangles], region)
+    tiles = _tile_lists([dr.gather(mi.UInt32, v, by_depth_order) for v in rectangles], region)
 
-    records = pack_records([*splats.geometry, *columns], by_rank)
+    records = pack_records([*splats.geometry, *columns], by_depth_order)
     geometry = fetch_record(
         records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N)
     )
@@ -89,7 +90,16 @@ def build_lists(
     bucket = mi.UInt32(6 * dr.log2(mi.Float(count) + 1))
     order = dr.detail.block_mkperm(255 - bucket, dr.width(count), 256)  # pyright: ignore[reportArgumentType]
     return BlockLists(
-        records, words, tiles.entries, begin, end, first, count, order, rank_of, by_rank
+        records,
+        words,
+        tiles.entries,
+        begin,
+        end,
+        first,
+        count,
+        order,
+        depth_order_of,
+        by_depth_order,
     )
 
 
@@ -140,20 +150,22 @@ def pack_records(columns: list[Float], order: UInt32) -> Float:
 
 
 def fetch_record(
-    records: Float, rank: UInt32, length: int, packets: int | None = None
+    records: Float, depth_order: UInt32, length: int, packets: int | None = None
 ) -> list[Float]:
-    """Return the first `length` floats of the record at `rank`, which has `packets`, by default as
-    many as needed.
+    """Return the first `length` floats of a record, which has `packets`, by default as many as
+    needed.
     """
     count = -(-length // 4)
-    reads = (dr.gather(mi.Vector4f, records, rank * (packets or count) + j) for j in range(count))
+    reads = (
+        dr.gather(mi.Vector4f, records, depth_order * (packets or count) + j) for j in range(count)
+    )
     return [v for packet in reads for v in packet][:length]
 
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The coarse lists: ranks by tile and depth, the slot of each entry's tile, first and end entry
-    of each slot.
+    """The coarse lists: depth orders by tile, the slot of each entry's tile, first and end entry of
+    each slot.
     """
 
     entries: UInt32
@@ -209,7 +221,7 @@ def _tile_rectangles(splats: Splats, region: Region) -> tuple[UInt32, UInt32, UI
 
 
 def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
-    """Enter every rank into the region's tiles within its rectangle, and sort by tile."""
+    """Enter every depth order into the region's tiles within its rectangle, and sort by tile."""
     x0, y0, columns, counts = rectangles
     N = dr.width(counts)
     slots = region.num_tiles
@@ -224,19 +236,34 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     if total == 0:
         return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
     slot_at = dr.empty(mi.UInt32, total)
-    rank_at = dr.empty(mi.UInt32, total)
+    depth_order_at = dr.empty(mi.UInt32, total)
     across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
 
-    def enter(place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at):
+    def enter(
+        place, end, column, tile, columns, depth_order, across, slot_of, slot_at, depth_order_at
+    ):
         slot = tile if region.whole else dr.gather(mi.UInt32, slot_of, tile)
         is_drawn = region.whole or slot != NO_SLOT
         dr.scatter(slot_at, slot, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(rank_at, rank, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(
+            depth_order_at, depth_order, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts
+        )
         place = place + 1 if region.whole else dr.select(is_drawn, place + 1, place)
         wrap = column + 1 == columns
         column = dr.select(wrap, 0, column + 1)
         tile = dr.select(wrap, tile + across + 1 - columns, tile + 1)
-        return place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at
+        return (
+            place,
+            end,
+            column,
+            tile,
+            columns,
+            depth_order,
+            across,
+            slot_of,
+            slot_at,
+            depth_order_at,
+        )
 
     state = (
         end - counts,
@@ -248,15 +275,15 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
         across,
         region.slot_of,
         slot_at,
-        rank_at,
+        depth_order_at,
     )
-    *_, slot_at, rank_at = dr.while_loop(
+    *_, slot_at, depth_order_at = dr.while_loop(
         state, lambda place, end, *_: place < end, enter, label="tile entries"
     )
-    dr.eval(slot_at, rank_at)
+    dr.eval(slot_at, depth_order_at)
 
     perm, slot_at, first, end = sorted_buckets(slot_at, slots)
-    entries = dr.gather(mi.UInt32, rank_at, perm)
+    entries = dr.gather(mi.UInt32, depth_order_at, perm)
     dr.eval(entries)
     return _Tiles(entries, slot_at, first, end)
 

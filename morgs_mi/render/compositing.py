@@ -84,7 +84,7 @@ class _Blend(dr.CustomOp):
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
-        tangents = pack_records(grads, self.lists.by_rank)
+        tangents = pack_records(grads, self.lists.by_depth_order)
         images = recorded(tangent, self.layout)(
             self.blocks, self.lists.records, tangents, self._allocated()
         )
@@ -131,7 +131,7 @@ def _gradients(
     """Return the gradients of the geometry (if the layout reaches it) and the columns, from the
     images' gradients.
     """
-    N = dr.width(lists.by_rank)
+    N = dr.width(lists.by_depth_order)
     stride = 4 * record_packets(layout)
     num_blocks = dr.width(lists.order)
     launches, num_sections, lanes = sections(num_blocks)
@@ -157,7 +157,7 @@ def _gradients(
     ]
     sums = sum(parts[1:], parts[0])
     dr.eval(sums)
-    lane = lists.rank_of * stride
+    lane = lists.depth_order_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
     return [
         dr.gather(mi.Float, sums, lane + k) for k in range(start, layout.geometry + layout.columns)

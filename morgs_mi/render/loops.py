@@ -216,10 +216,10 @@ class _Block:
 def _advance(
     walk: tuple[UInt32, UInt32, UInt32], end: UInt32, words: UInt32, entries: UInt32
 ) -> tuple[UInt32, tuple[UInt32, UInt32, UInt32]]:
-    """Return the rank at a lane's current entry, and the walk advanced to the next entry."""
+    """Return the depth order at a lane's current entry, and the walk advanced to the next entry."""
     place, word, base = walk
-    rank = dr.gather(mi.UInt32, entries, base + dr.tzcnt(word))
-    return rank, next_entry(place, word & (word - 1), base, end, words)
+    depth_order = dr.gather(mi.UInt32, entries, base + dr.tzcnt(word))
+    return depth_order, next_entry(place, word & (word - 1), base, end, words)
 
 
 def _floats(count: int, value: float = 0.0) -> list[Float]:
@@ -272,8 +272,8 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
     C = layout.columns
 
     def body(walk, end, x, y, limits, T, sums, records, words, entries):
-        rank, walk = _advance(walk, end, words, entries)
-        record = fetch_record(records, rank, G + C)
+        depth_order, walk = _advance(walk, end, words, entries)
+        record = fetch_record(records, depth_order, G + C)
         geometry = record[:G]
         values = record[G:]
         dx, dy = block.offsets(x, y, geometry)
@@ -315,16 +315,16 @@ def adjoint(
     first_record: UInt32,
     sums: Float,
 ) -> Float:
-    """Add dL/d(record) to `sums`, which has a record of each rank: the geometry's floats, the
-    columns, padding.
+    """Add dL/d(record) to `sums`, which has a record of each Gaussian by depth order: the
+    geometry's floats, the columns, padding.
 
     Args:
         layout: description of the blend.
         blocks: the blocks and their lists.
-        records: records of N ranks.
+        records: records of N Gaussians.
         images: images that `primal` returned.
         image_grads: their gradients.
-        first_record: the record of rank 0 that each lane adds to, see `backend.sections`.
+        first_record: the record of depth order 0 that each lane adds to, see `backend.sections`.
         sums: the records.
     """
     block = _Block(layout, blocks)
@@ -340,8 +340,8 @@ def adjoint(
     ]
 
     def body(walk, end, x, y, limits, T, S, g, records, words, entries, first_record, sums):
-        rank, walk = _advance(walk, end, words, entries)
-        record = fetch_record(records, rank, G + C)
+        depth_order, walk = _advance(walk, end, words, entries)
+        record = fetch_record(records, depth_order, G + C)
         geometry = record[:G]
         values = record[G:]
         dx, dy = block.offsets(x, y, geometry)
@@ -378,7 +378,7 @@ def adjoint(
         grads += _floats(packets * 4 - len(grads))
         for k in range(packets):
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
-            place = (first_record + rank) * packets + k
+            place = (first_record + depth_order) * packets + k
             dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, place, mode=mode)
         next_state = (walk, end, x, y, limits, T_next, S_next, g, records, words, entries)
         return *next_state, first_record, sums
@@ -467,8 +467,8 @@ def tangent(
     C = layout.columns
 
     def body(walk, end, x, y, limits, T, dT, dsums, records, tangents, words, entries):
-        rank, walk = _advance(walk, end, words, entries)
-        record, tangent = (fetch_record(r, rank, G + C) for r in (records, tangents))
+        depth_order, walk = _advance(walk, end, words, entries)
+        record, tangent = (fetch_record(r, depth_order, G + C) for r in (records, tangents))
         geometry = record[:G]
         values = record[G:]
         a, b, c = geometry[2:5]

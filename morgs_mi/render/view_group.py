@@ -170,7 +170,7 @@ class Drawing:
         splats, lists = self.drawn
         with dr.suspend_grad():
             columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
-            records = pack_records([*splats.geometry, *columns], lists.by_rank)
+            records = pack_records([*splats.geometry, *columns], lists.by_depth_order)
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
             grads = weighted_sums(
                 [image], self.group.region, replace(lists, records=records), layout

@@ -22,9 +22,9 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.fit.view import View
 from morgs_mi.studio.calibration.checks.mistakes import (
     camera_candidates,
+    duplicate_poses,
     focal_candidates,
     rig_candidates,
-    duplicate_poses,
     with_focal_factor,
 )
 
