@@ -29,6 +29,7 @@ from .stream_loop import StreamLoop
 from .studio.light.light_probe import light_probe
 from .studio.light.shadows import shadow_ratio, shadowed
 from .studio.live.live_frames import live_frames
+from .studio.sweep import leave_out, sweep
 from .studio.synth.synth_config import SynthConfig
 from .studio.synth.synthesize import synthesize
 from .surfaces.splat_rays import SplatRays
@@ -56,6 +57,7 @@ __all__ = [
     "depth_image",
     "ellipsoids",
     "evaluate_stream",
+    "leave_out",
     "light_probe",
     "live_frames",
     "load_capture",
@@ -71,6 +73,7 @@ __all__ = [
     "shadow_ratio",
     "shadowed",
     "stream_capture",
+    "sweep",
     "synthesize",
     "with_near_planes",
     "write_ply",

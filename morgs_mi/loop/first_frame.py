@@ -135,7 +135,7 @@ def with_first_confidence(
     """
     config = setup.config
     motion = config.motion
-    if not flows or not motion.learn_confidence:
+    if not (flows and motion.learn_confidence and config.fit.confidence_steps):
         return gaussians
     masks = {
         v: motion_mask(

@@ -229,7 +229,8 @@ def _flows(
     a term uses it.
     """
     motion = setup.config.motion
-    with_masks = motion.learn_confidence and frame % motion.mask_interval == 0
+    has_mask_loss = motion.learn_confidence and setup.config.fit.objective.mask_weight > 0
+    with_masks = has_mask_loss and frame % motion.mask_interval == 0
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
         return {}, {}
     common_views = sorted(previous.keys() & images.keys())

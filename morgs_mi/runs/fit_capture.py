@@ -44,6 +44,7 @@ def stream_capture(
     config: StreamConfig | None = None,
     resume: bool = False,
     progress: Report | None = None,
+    on_provisional: Callable[[Packet], None] | None = None,
 ) -> list[FrameReport]:
     """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with
     every frame.
@@ -60,6 +61,8 @@ def stream_capture(
         resume: continue after the last complete packet of the stream in `out`, if there is one.
             The stream has the same bytes as without an interruption.
         progress: called with (stage, done, total): matching views, the first frame, later frames.
+        on_provisional: called with provisional keyframes while the first frame is fitted, after
+            they are written beside the stream.
 
     Returns:
         The reports of all frames, including those before an interruption.
@@ -96,11 +99,15 @@ def stream_capture(
         last = prepared.capture.num_frames - 1
         later_frames = stages.of("Later frames")
         with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
+
+            def show(keyframe: Packet) -> None:
+                recording.show(keyframe)
+                if on_provisional is not None:
+                    on_provisional(keyframe)
+
             for frame, upcoming in with_next(frames):
                 stage = later_frames.part(frame.index - 1, last) if frame.index else stages
-                packet, report = push_frame(
-                    loop, frame, train, stage.report, upcoming, recording.show
-                )
+                packet, report = push_frame(loop, frame, train, stage.report, upcoming, show)
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 report = replace(report, fingerprints=image_fingerprints(frame.images))
                 recording.push(packet, report, loop.state.coded)

@@ -1,33 +1,46 @@
-"""`morgs-mi sweep`: error against run time of a recording."""
+"""`morgs-mi sweep`: error against run time of a capture."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import HeldOut, Settings, held_out, optional
+from morgs_mi.cli.settings import Flag, HeldOut, Settings, held_out, optional, place
+from morgs_mi.loop.stream_config import PresetName
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Fit and score a capture with several numbers of epochs: error against run time."""
+    """Fit and score a capture with several presets, numbers of epochs and seeds: error against run
+    time.
+
+    Fits that are in OUT are not made again.
+    """
 
     capture: Positional[Path]
     """Folder of the capture."""
-    out: Positional[Path]
-    """Folder for the streams and sweep.json."""
+    out: Annotated[Positional[Path], place("OUT")] = Path("sweep")
+    """Folder for the streams, sweep.json and sweep.png, by default sweep."""
+    presets: tuple[PresetName | Literal["default"], ...] = ("baseline", "default")
+    """Presets; default: the settings as they are."""
     epochs: tuple[int, ...] = (1, 2, 4, 8)
-    """Passes over the views for every later frame, of each fit."""
-    seeds: int = 1
+    """Passes over the views for every later frame."""
+    seeds: int = 3
     """Number of fits with each, whose scores are averaged."""
-    frames: Annotated[int | None, DisallowNone, optional("INT", "(default: all)")] = None
-    """Number of frames to fit, from the first one."""
+    frames: int = 8
+    """Most frames that are fitted, from the first one."""
+    leave_out: Flag = False
+    """Instead of presets and epochs, leave out each part of the method alone, and print the
+    settings that the scene does not need.
+    """
+    tolerance: float = 0.05
+    """Loss of PSNR up to which a part is not needed, dB."""
     downscale: float = 1
     """Factor by which the images are reduced."""
     test_view: HeldOut = ("auto",)
@@ -36,28 +49,32 @@ class Sweep:
     """
     config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
     """File with any settings, as `fit --print-config` writes it."""
-    plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
+    plot: Annotated[Path | None, DisallowNone, optional("FILE", "(default: OUT/sweep.png)")] = None
     """Plot of the scores over time: .png, .jpg, .svg or .pdf; needs the extra plots."""
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
         from morgs_mi.core.plots import check_plot
-        from morgs_mi.evaluate.tables import figure
-        from morgs_mi.studio.sweep import SCORES, mean_scores, sweep, write_sweep_plot
+        from morgs_mi.studio.sweep import leave_out, sweep
 
-        if self.plot is not None:
-            check_plot(self.plot)
+        name = "leave-out" if self.leave_out else "sweep"
+        plot = self.plot or self.out / f"{name}.png"
+        check_plot(plot)
         config = Settings(config=self.config).stream_config()
-        capture = load_capture(self.capture, self.downscale, held_out(self.test_view), self.frames)
+        capture = load_capture(self.capture, self.downscale, held_out(self.test_view))
+        common = (self.seeds, self.frames, self.out, config)
         with progress() as report:
-            rows = sweep(capture, self.out, self.epochs, self.seeds, config, report)
-        titles = (title for title, _ in SCORES.values())
-        table = Table("epochs", *titles, box=SIMPLE_HEAD, title="means over the seeds")
-        for row in mean_scores(rows):
-            cells = (figure(row[name], digits) for name, (_, digits) in SCORES.items())
-            table.add_row(figure(row["epochs"], 0), *cells)
+            if self.leave_out:
+                result = leave_out(capture, self.tolerance, *common, report)
+            else:
+                result = sweep(capture, self.presets, self.epochs, *common, report)
+        titles, *rows = result.table
+        table = Table(*titles, box=SIMPLE_HEAD, title="means ± standard deviations over the seeds")
+        for row in rows:
+            table.add_row(*row)
         print_table(table)
-        print_result(f"All fits: {self.out / 'sweep.json'}")
-        if self.plot is not None:
-            write_sweep_plot(self.plot, rows)
-            print_result(f"Plot: {self.plot}")
+        result.plot(plot)
+        for text in (result.sentence, result.toml.rstrip()):
+            if text:
+                print_result(text)
+        print_result(f"Results: {self.out / name}.json, {plot}")
