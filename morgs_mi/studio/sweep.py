@@ -15,7 +15,8 @@ import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
+from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,7 +31,6 @@ from morgs_mi.core.config import apply_values, check_value
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.fit_names import REPORT
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.plots import check_plot
 from morgs_mi.core.progress import Progress, Report
@@ -44,7 +44,7 @@ from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.fit_capture import push_frame, stream_capture
 from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.studio.sweep_plot import plot_bytes
+from morgs_mi.studio.sweep_plot import draw_sweep
 
 PARTS = {
     "flow guidance": "motion.learn_motion = false",
@@ -108,16 +108,17 @@ class Sweep:
         """
         path = Path(path)
         check_plot(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(plot_bytes(self, path.suffix[1:].lower()))
+        draw_sweep(self).savefig(path)
 
     def _repr_html_(self) -> str:
         rows = ("".join(f"<td>{html.escape(cell)}" for cell in row) for row in self.table)
         text = f"<table><tr>{'<tr>'.join(rows)}</table>{html.escape(self.sentence)}"
         with suppress(ImportError):
-            image = base64.b64encode(plot_bytes(self, "png")).decode()
+            data = BytesIO()
+            draw_sweep(self).savefig(data)
+            image = base64.b64encode(data.getvalue()).decode()
             text += f'<img alt="Scores over seconds" src="data:image/png;base64,{image}">'
-        return f"{text}<pre>{html.escape(self.toml)}</pre>"
+        return f"{text}<pre>{self.toml}</pre>"
 
 
 @interrupts_raised()
@@ -157,8 +158,8 @@ def sweep(
     for preset in presets:
         method = config if preset == "default" else apply_preset(config, preset)
         for count in epochs:
-            arms.append((preset, apply_values(method, {"fit": {"epochs": count}}, "sweep()"), True))
-    result = _fit_arms(arms, config, capture, seeds, frames, Path(out), progress)
+            arms.append((preset, replace(method, fit=replace(method.fit, epochs=count)), True))
+    result = fit_arms(arms, config, capture, seeds, frames, Path(out), progress)
     table = [
         [arm, str(count), *_cells(scores)]
         for arm, count, scores in zip(result.arms, result.epochs, result.scores, strict=True)
@@ -210,11 +211,11 @@ def leave_out(
 
     parts = [part for part in PARTS if without([part])[1] != config]
     arms = [("all parts", config, True), *(without([part]) for part in parts)]
-    result = _fit_arms(arms, *common)
+    result = fit_arms(arms, *common)
     needed = _are_needed(result, tolerance)
     left_out = [part for part, is_needed in zip(parts, needed[1:], strict=True) if not is_needed]
     while len(left_out) > 1:
-        result = _fit_arms([*arms, without(left_out)], *common)
+        result = fit_arms([*arms, without(left_out)], *common)
         needed = _are_needed(result, tolerance)
         if not needed[-1]:
             break
@@ -262,7 +263,7 @@ def _cells(scores: np.ndarray, sign: str = "-") -> list[str]:
     return cells
 
 
-def _fit_arms(
+def fit_arms(
     arms: Sequence[Arm],
     first_config: StreamConfig,
     capture: Capture,
@@ -278,26 +279,42 @@ def _fit_arms(
     check_value("sweep()", "frames", frames, Annotated[int, Ge(2)])
     capture = replace(capture, num_frames=min(frames, capture.num_frames))
     frame = next(capture.partial_frames(0, 1))
-    warm_configs: set[StreamConfig] = set()
 
-    def scores_of(
-        folder: Path, config: StreamConfig, start: Any, fit: Callable[[dict[str, Any]], Any]
-    ) -> Any:
+    @cache
+    def compile_kernels(config: StreamConfig) -> None:
+        loop = StreamLoop.of(capture, config)
+        for frame in capture.partial_frames(0, _WARM_FRAMES):
+            push_frame(loop, frame, capture.train_views)
+
+    def scores_of(folder: Path, config: StreamConfig, start: Any, fit: Callable[..., Any]) -> Any:
         """Return the scores of a fit, made unless they are there of the same capture, settings and
         start.
         """
+        path = folder / "scores.json"
         metadata = stream_metadata(capture, frame, config)
         made = json.loads(json.dumps([metadata, start]))
-        path = folder / "scores.json"
         if not path.exists() or read_json(path)["made"] != made:
-            warm = replace(apply_values(config, _WARM), seed=0)
-            if warm not in warm_configs:
-                warm_configs.add(warm)
-                loop = StreamLoop.of(capture, warm)
-                for each in capture.partial_frames(0, _WARM_FRAMES):
-                    push_frame(loop, each, capture.train_views)
-            write_json(path, {"made": made, "scores": fit(metadata)})
+            compile_kernels(replace(apply_values(config, _WARM), seed=0))
+            write_json(path, {"made": made, "scores": fit(folder, config, metadata)})
         return read_json(path)["scores"]
+
+    def fit_first(folder: Path, config: StreamConfig, _: Any) -> list[list[float]]:
+        shown = []
+        begin = time.perf_counter()
+
+        def show(keyframe: Packet | None) -> None:
+            shown.append((time.perf_counter() - begin, keyframe))
+
+        stream_capture(replace(capture, num_frames=1), folder, config, on_provisional=show)
+        show(next(iter(open_stream(folder))))
+        (frame,) = ComparedClip.of(open_stream(folder), capture.path).frames()
+        curve = []
+        for seconds, keyframe in shown:
+            state = replace(frame.state, gaussians=decode(None, keyframe).gaussians)
+            views = replace(frame, state=state).views()
+            scores = [psnr(view.rendered, view.recorded, view.valid) for view in views]
+            curve.append([seconds, known_mean(scores)])
+        return curve
 
     first_frames = []
     scores = np.full((len(arms), seeds, len(TITLES)), np.nan)
@@ -305,48 +322,27 @@ def _fit_arms(
     with locked_folder(out, "sweep()"):
         for seed in range(seeds):
             first = out / f"first-seed{seed}"
-            config = replace(first_config, seed=seed)
-            fit_first = partial(_fit_first, capture, first, config)
-            first_frames.append(scores_of(first, config, None, fit_first))
-            for k, (name, method, shares_first) in enumerate(arms):
+            curve = scores_of(first, replace(first_config, seed=seed), None, fit_first)
+            first_frames.append(curve)
+            for k, (name, config, shares_first) in enumerate(arms):
                 stage = fits.part(seed * len(arms) + k, seeds * len(arms))
-                config = replace(method, seed=seed)
                 label = f"{name}-epochs{config.fit.epochs}-seed{seed}"
                 folder = out / label.replace(", ", "+").replace(" ", "-")
                 start = first if shares_first else None
-                fit = partial(_fit_later, capture, folder, config, start, stage.report)
-                scores[k, seed] = scores_of(folder, config, first_frames[-1], fit)
+                fit = partial(_fit_later, capture, start, stage.report)
+                scores[k, seed] = scores_of(folder, replace(config, seed=seed), curve, fit)
                 stage(1, 1)
-    names, methods, _ = zip(*arms, strict=True)
-    epochs = [method.fit.epochs for method in methods]
+    names, configs, _ = zip(*arms, strict=True)
+    epochs = [config.fit.epochs for config in configs]
     return Sweep(capture.path.name, bool(capture.test_views), names, epochs, scores, first_frames)
-
-
-def _fit_first(capture: Capture, folder: Path, config: StreamConfig, _: Any) -> list[list[float]]:
-    """Fit the first frame; return pairs of seconds and PSNR while it was fitted."""
-    shown: list[tuple[float, Gaussians]] = []
-    begin = time.perf_counter()
-
-    def show(keyframe: Packet) -> None:
-        shown.append((time.perf_counter() - begin, decode(None, keyframe).gaussians))
-
-    stream_capture(replace(capture, num_frames=1), folder, config, on_provisional=show)
-    end = time.perf_counter() - begin
-    (frame,) = ComparedClip.of(open_stream(folder), capture.path).frames()
-    curve = []
-    for seconds, gaussians in [*shown, (end, frame.state.gaussians)]:
-        views = replace(frame, state=replace(frame.state, gaussians=gaussians)).views()
-        scores = [psnr(view.rendered, view.recorded, view.valid) for view in views]
-        curve.append([seconds, known_mean(scores)])
-    return curve
 
 
 def _fit_later(
     capture: Capture,
-    folder: Path,
-    config: StreamConfig,
     first: Path | None,
     progress: Report | None,
+    folder: Path,
+    config: StreamConfig,
     metadata: dict[str, Any],
 ) -> list[float | None]:
     """Fit an arm, from the first frame in a folder if there is one; return its scores."""
@@ -354,8 +350,8 @@ def _fit_later(
         stream = open_stream(first)
         (packet,) = stream
         (report,) = read_reports(first / REPORT, range(1))
-        rig = as_fitted(capture, stream)
         folder.mkdir(exist_ok=True)
+        rig = as_fitted(capture, stream)
         with Recording(FitFiles.of(folder), rig, stream.metadata | metadata) as recording:
             recording.push(packet, report, None)
     stream_capture(capture, folder, config, first is not None, progress)

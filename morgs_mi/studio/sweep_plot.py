@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 from itertools import cycle
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
@@ -11,20 +10,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from morgs_mi.studio.sweep import Sweep
 
 # Of Okabe and Ito, which readers with any vision of colours distinguish.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-# Titles of the panels of scores, by index.
+# Titles of the panels, by the scores' indices.
 _PANELS = {
     2: "PSNR, dB",
     3: "PSNR of moving pixels, dB",
     4: "motion error of moving pixels, px",
-    5: "size of a later frame, kB",
+    5: "size, kB",
 }
-# Inches of a panel.
-_WIDTH = 4.4
-_HEIGHT = 3.2
+_FIRST = "PSNR of the first frame, dB"
+# Inches.
+_WIDTH = 9.0
+_HEIGHT = 3.3  # of a panel
 # Least range of an axis of PSNR, dB, and least ratio of the ends of an axis of seconds.
 _LEAST_DB = 3.0
 _LEAST_RATIO = 6.0
@@ -33,48 +35,37 @@ _LEAST_RATIO = 6.0
 Curve = tuple[np.ndarray, np.ndarray, Sequence[Any]]
 
 
-def plot_bytes(result: Sweep, suffix: str) -> bytes:
-    """Return the plot of a sweep as a file: the scores over the seconds of a later frame, a curve
-    for each arm, and the PSNR of the first frame over the seconds of its fit.
+def draw_sweep(result: Sweep) -> Figure:
+    """Return the plot of a sweep: the scores over the seconds of a later frame, a curve for each
+    arm, and the PSNR of the first frame over the seconds since its fit began.
 
     Raises:
         ImportError: matplotlib is not installed.
     """
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    seconds, psnr = np.transpose(result.first_frames, (2, 1, 0))
-    panels = [
-        (k, title) for k, title in _PANELS.items() if np.isfinite(result.scores[..., k]).any()
-    ]
-    columns = 2 if len(panels) < 4 else 3
-    lines = len(panels) // columns + 1
-    views = "held-out" if result.held_out else "training"
-    data = BytesIO()
-    with rc_context({"text.parse_math": False, "font.size": 9}):
-        figure = Figure((_WIDTH * columns, _HEIGHT * lines), layout="constrained")
-        figure.suptitle(
-            f"{result.capture}, {views} views; numbers: epochs, "
-            f"bars: standard deviation over {len(result.first_frames)} seeds"
-        )
-        for place, (k, title) in enumerate(panels, 1):
-            curves = {}
+    panels: dict[str, dict[str, Curve]] = {}
+    for k, title in _PANELS.items():
+        if np.isfinite(result.scores[..., k]).any():
+            panels[title] = {}
             for name in result.arms:
                 rows = [row for row, arm in enumerate(result.arms) if arm == name]
                 rows.sort(key=lambda row: result.epochs[row])
                 x, y = result.scores[rows][..., [1, k]].transpose(2, 0, 1)
-                curves[name] = x, y, [result.epochs[row] for row in rows]
-            axes = figure.add_subplot(lines, columns, place, xlabel="seconds of a later frame")
-            _draw_curves(axes, title, curves)
-        axes = figure.add_subplot(
-            lines, columns, len(panels) + 1, xlabel="seconds since the start of the first frame"
-        )
-        _draw_curves(axes, _PANELS[2], {"first frame": (seconds, psnr, ())})
-        figure.savefig(data, format=suffix)
-    return data.getvalue()
+                panels[title][name] = x, y, [result.epochs[row] for row in rows]
+    panels[_FIRST] = {"first frame": (*np.transpose(result.first_frames, (2, 1, 0)), ())}
+    lines = -(-len(panels) // 2)
+    figure = Figure((_WIDTH, _HEIGHT * lines), layout="constrained")
+    views = "held-out" if result.held_out else "training"
+    seeds = len(result.first_frames)
+    title = f"{result.capture}, {views} views, {seeds} seeds (bars: standard deviation)"
+    figure.suptitle(title, parse_math=False)
+    for place, (title, curves) in enumerate(panels.items(), 1):
+        draw_curves(figure.add_subplot(lines, 2, place), title, curves)
+    return figure
 
 
-def _draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
+def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
     """Draw a score over seconds, a curve for each arm with its name at the end."""
     ends = []
     for color, (name, (x, y, labels)) in zip(cycle(_COLORS), curves.items(), strict=False):
@@ -96,6 +87,7 @@ def _draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
     low, high = (low - margin, high + margin) if title.endswith("dB") else (0, 1.05 * high)
     axes.set_ylim(low, high)
     axes.set_title(title, loc="left")
+    axes.set_xlabel("seconds since its start" if title == _FIRST else "seconds of a later frame")
     axes.grid(color="0.9")
     # Names beside the panel, in the order of the ends.
     heights = np.linspace(0, 1, len(ends) + 2)[1:-1]

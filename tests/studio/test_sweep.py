@@ -1,108 +1,195 @@
-"""A sweep fits a ladder of epochs and seeds, and its scores are those of an evaluation."""
+"""Sweeps: arms continue one first frame, their scores are those of an evaluation, and fits that are
+there are not made again. Parts are left out alone and together.
+"""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 
-import cv2
+import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.core.config import config_toml
+from morgs_mi.core.config import apply_values, config_toml, read_config
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import ViewScores
+from morgs_mi.fit.fit_config import DensityConfig
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.studio import sweep as module
-from morgs_mi.studio.sweep import mean_scores, sweep, write_sweep_plot
-from tests.cli.commands import assert_refused
+from morgs_mi.studio.sweep import PARTS, TITLES, Sweep, leave_out, sweep
+from morgs_mi.studio.sweep_plot import draw_curves
+from tests.cli.commands import assert_refused, interrupt
 from tests.cli.conftest import run
+from tests.quick import quick
 from tests.scenes.recording import CONFIG, write_recording
 
 __all__ = ["run"]
 
-
-@pytest.mark.slow
-def test_sweep__scores_every_number_of_epochs_with_every_seed(tmp_path, monkeypatch):
-    capture = load_capture(write_recording(tmp_path / "clip", 2))
-    calls = []
-    for name in ("_compile_kernels", "stream_capture"):
-        original = getattr(module, name)
-        monkeypatch.setattr(
-            module, name, lambda *a, f=original, n=name: (calls.append(n), f(*a))[1]
-        )
-    rows = sweep(capture, tmp_path / "out", (2, 1, 2), 2, CONFIG)
-    assert calls == ["_compile_kernels"] + 4 * ["stream_capture"]
-    assert [(row["epochs"], row["seed"]) for row in rows] == [(2, 0), (2, 1), (1, 0), (1, 1)]
-    for row in rows:
-        folder = tmp_path / f"out/epochs{row['epochs']}-seed{row['seed']}"
-        config = open_stream(folder).metadata["config"]
-        assert (config["fit"]["epochs"], config["seed"]) == (row["epochs"], row["seed"])
-        assert config["fit"]["num_gaussians"] == CONFIG.fit.num_gaussians
-    result = evaluate_stream(tmp_path / "out/epochs1-seed1")
-    assert rows[3]["psnr"] == result.scores.psnr
-    assert (
-        rows[3]["bytes_per_frame"]
-        == (tmp_path / "out/epochs1-seed1/stream.morgs").stat().st_size / 2
-    )
-    assert rows[3]["later_seconds"] == result.seconds.per_later_frame
-    written = json.loads((tmp_path / "out/sweep.json").read_text())["rows"]
-    assert [row["psnr"] for row in written] == [row["psnr"] for row in rows]
+# Provisional first frames come from its rounds of density control.
+QUICK = quick(density=DensityConfig(rounds=2, later_frames=False))
 
 
 @pytest.mark.slow
-def test_sweep__prints_a_table_and_plots(tmp_path, run):
+def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path, monkeypatch):
+    capture = load_capture(write_recording(tmp_path / "clip", 3), test_view=0)
+    out = tmp_path / "out"
+    states = []
+    arguments = (capture, ("default", "baseline"), (2, 1), 2, 2, out, QUICK)
+    result = sweep(*arguments, lambda *state: states.append(state))
+    assert [*result.arms] == ["default"] * 2 + ["baseline"] * 2
+    assert [*result.epochs] == [2, 1, 2, 1]
+    assert {(stage, total) for stage, _, total in states} == {("Fitting and evaluating", 8)}
+    assert states[-1][1] == 8
+
+    first_packets = {}
+    for k, (arm, epochs) in enumerate(zip(result.arms, result.epochs, strict=True)):
+        for seed in range(2):
+            folder = out / f"{arm}-epochs{epochs}-seed{seed}"
+            stream = open_stream(folder)
+            config = stream.metadata["config"]
+            assert (config["fit"]["epochs"], config["seed"]) == (epochs, seed)
+            assert config["motion"]["learn_motion"] == (arm == "default")
+            assert [packet.frame for packet in stream] == [0, 1]
+            first_packets.setdefault(seed, set()).add(next(iter(stream)).encoded)
+            evaluation = evaluate_stream(folder)
+            later = ViewScores.mean([frame.scores for frame in evaluation.frames[1:]])
+            expected = [evaluation.seconds.first, evaluation.seconds.per_later_frame, later.psnr]
+            assert result.scores[k, seed, :3].tolist() == expected
+            assert result.first_frames[seed][-1][1] == evaluation.frames[0].scores.psnr
+    assert [len(packets) for packets in first_packets.values()] == [1, 1]
+    assert first_packets[0] != first_packets[1]
+    for curve in result.first_frames:
+        seconds = [second for second, _ in curve]
+        assert len(curve) == 3
+        assert seconds == sorted(seconds)
+
+    document = json.loads((out / "sweep.json").read_text())
+    assert {"machine", "versions", "capture", "held_out"} <= {*document}
+    assert document["scores"][3][1][2] == result.scores[3, 1, 2]
+
+    monkeypatch.setattr(module, "stream_capture", interrupt)
+    again = sweep(*arguments)
+    np.testing.assert_array_equal(again.scores, result.scores)
+    assert again.table == result.table
+    with pytest.raises(KeyboardInterrupt):
+        sweep(*arguments[:4], 3, out, QUICK)
+
+
+@pytest.mark.slow
+def test_leave_out__parts_of_the_first_frame_have_their_own(tmp_path, monkeypatch, run):
+    names = ("offset", "exposure")
+    monkeypatch.setattr(module, "PARTS", {name: PARTS[name] for name in names})
     clip = write_recording(tmp_path / "clip", 2)
     out = tmp_path / "out"
-    plot = tmp_path / "plots/sweep.png"
     settings = tmp_path / "settings.toml"
     settings.write_text(config_toml(replace(CONFIG, seed=5)))
-    status, output, _ = run(
-        "sweep", clip, out, "--epochs", 1, 2, "--config", settings, "--plot", plot
-    )
+    options = ("--seeds", 1, "--frames", 2, "--config", settings, "--tolerance", 100)
+    status, output, _ = run("sweep", clip, out, "--leave-out", *options)
     assert status == 0
-    header, *_ = (line.split() for line in output.splitlines() if "epochs" in line)
-    assert (
-        " ".join(header)
-        == "epochs first, s later, s bytes PSNR, dB moving, dB motion error, px IoU"
-    )
-    rows = [line.split() for line in output.splitlines() if line.split()[:1] in (["1"], ["2"])]
-    assert [(row[0], row[-1]) for row in rows] == [("1", "-"), ("2", "-")], (
-        "there is no ground truth"
-    )
-    image = cv2.imread(str(plot))
-    assert image.shape[1] > 2 * image.shape[0]
-    assert image.std() > 5
+    assert "Within 100 dB, this scene does not need offset, exposure" in output
+    for name in names:
+        config = open_stream(out / f"without-{name}-epochs2-seed0").metadata["config"]
+        assert config["motion"]["learn_offset"] == (name != "offset")
+        assert config["fit"]["exposure"] == ("off" if name == "exposure" else "auto")
+    config = apply_values(StreamConfig(), read_config(out / "leave-out.toml"))
+    assert not config.motion.learn_offset
+    assert config.fit.exposure == "off"
+    assert (out / "leave-out.png").stat().st_size > 10_000
 
 
-NAMES = (
-    "first_seconds",
-    "later_seconds",
-    "bytes_per_frame",
-    "psnr",
-    "psnr_moving",
-    "motion_error_moving",
+def fake_fits(losses):
+    """Return a function in place of `fit_arms`: the PSNR that each arm loses, and the motion error
+    that it adds, for the parts that it lacks.
+    """
+
+    def fit_arms(arms, *_):
+        scores = np.ones((len(arms), 2, len(TITLES)))
+        for k, (name, *_) in enumerate(arms[1:], 1):
+            scores[k, :, 2:5] += losses(name.removeprefix("without ").split(", "))
+        names = [name for name, *_ in arms]
+        return Sweep("clip", True, names, [8] * len(arms), scores, [[(1.0, 20.0), (2.0, 21.0)]] * 2)
+
+    return fit_arms
+
+
+def without_any(parts):
+    return np.zeros(3)
+
+
+def without_search_or_offset(parts):
+    """Search and propagation stand in for each other, the moving pixels need the offset, and the
+    motion needs the flow guidance.
+    """
+    lost = {"search", "propagation"} <= {*parts}
+    return np.array(
+        [
+            -1.0 * lost - 0.01 * ("search" in parts),
+            -1.0 * ("offset" in parts),
+            "flow guidance" in parts,
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("losses", "needed"),
+    [(without_any, set()), (without_search_or_offset, {"flow guidance", "offset", "search"})],
 )
+def test_leave_out__finds_the_parts_that_are_not_needed_together(
+    tmp_path, monkeypatch, losses, needed
+):
+    monkeypatch.setattr(module, "fit_arms", fake_fits(losses))
+    result = leave_out(None, out=tmp_path)
+    left_out = [part for part in PARTS if part not in needed]
+    assert ", ".join(left_out) in result.sentence
+    config = apply_values(StreamConfig(), read_config(tmp_path / "leave-out.toml"))
+    for part, text in PARTS.items():
+        (tmp_path / "part.toml").write_text(text)
+        applied = apply_values(config, read_config(tmp_path / "part.toml"))
+        assert (applied == config) == (part in left_out)
+    rows = {row[0].removeprefix("without "): row[-1] for row in result.table[2:]}
+    assert rows[", ".join(left_out)] == "no"
 
 
-def test_mean_scores__are_over_the_seeds(tmp_path):
-    rows = [
-        {
-            "epochs": epochs,
-            "seed": seed,
-            **dict.fromkeys(NAMES, epochs + 0.5 * seed),
-            "confidence_iou": float("nan"),
-        }
-        for epochs in (4, 1)
-        for seed in range(3)
-    ]
-    means = mean_scores(rows)
-    assert [(row["epochs"], row["psnr"], row["later_seconds"]) for row in means] == [
-        (4, 4.5, 4.5),
-        (1, 1.5, 1.5),
-    ]
-    write_sweep_plot(tmp_path / "a.png", rows)
-    height, width, _ = cv2.imread(str(tmp_path / "a.png")).shape
-    assert 4 < width / height < 5, "four panels, none for what is unknown"
+def test_leave_out__may_find_that_all_parts_are_needed(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "fit_arms", fake_fits(lambda parts: np.full(3, -9)))
+    result = leave_out(None, out=tmp_path)
+    assert "needs each of the parts" in result.sentence
+    assert result.toml == ""
+
+
+def test_sweep__is_a_table_and_a_plot_in_a_notebook():
+    pytest.importorskip("matplotlib", reason="comes with the extra `plots`")
+    scores = np.array([[[9.0, 1, 30, np.nan, np.nan, 5]], [[9.0, 2, 31, np.nan, np.nan, 6]]])
+    curves = [[(1.0, 20.0), (2.0, 21.0)]]
+    table = [["arm", "kB"], ["<default>", "5"]]
+    text = Sweep("clip", True, ["default"] * 2, [1, 2], scores, curves, table)._repr_html_()
+    assert "<td>arm<td>kB<tr><td>&lt;default&gt;<td>5</table>" in text
+    assert "data:image/png;base64,iVBOR" in text
+
+
+@pytest.mark.parametrize("kind", ["PSNR, dB", "size, kB"])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_draw_curves__has_wide_axes_and_names(kind, seeds):
+    figure = pytest.importorskip("matplotlib.figure", reason="comes with the extra `plots`")
+    rng = np.random.default_rng(seeds)
+    curves = {
+        name: (rng.uniform(1, 1.1, (4, seeds)), rng.uniform(30, 30.3, (4, seeds)), [1, 2, 4, 8])
+        for name in ("baseline", "default")
+    }
+    axes = figure.Figure().subplots()
+    draw_curves(axes, kind, curves)
+    left, right = axes.get_xlim()
+    low, high = axes.get_ylim()
+    assert axes.get_xscale() == "log"
+    assert right / left >= 5.99
+    assert high - low >= 3
+    for x, y, _ in curves.values():
+        assert left < x.min() < x.max() < right
+        assert low < y.min() < y.max() < high
+    texts = [text.get_text() for text in axes.texts]
+    assert {"baseline", "default", "1", "8"} <= {*texts}
 
 
 @pytest.mark.parametrize(
@@ -110,7 +197,7 @@ def test_mean_scores__are_over_the_seeds(tmp_path):
     [
         (("--epochs", 0), "epochs must be at least 1, got 0"),
         (("--seeds", 0), "seeds must be at least 1, got 0"),
-        (("--plot", "a.txt"), "the suffix of a plot must be .png"),
+        (("--frames", 1), "frames must be at least 2, got 1"),
     ],
 )
 def test_sweep__refuses(tmp_path, run, options, message):

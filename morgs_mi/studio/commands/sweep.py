@@ -49,8 +49,6 @@ class Sweep:
     """
     config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
     """File with any settings, as `fit --print-config` writes it."""
-    plot: Annotated[Path | None, DisallowNone, optional("FILE", "(default: OUT/sweep.png)")] = None
-    """Plot of the scores over time: .png, .jpg, .svg or .pdf; needs the extra plots."""
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
@@ -58,7 +56,7 @@ class Sweep:
         from morgs_mi.studio.sweep import leave_out, sweep
 
         name = "leave-out" if self.leave_out else "sweep"
-        plot = self.plot or self.out / f"{name}.png"
+        plot = self.out / f"{name}.png"
         check_plot(plot)
         config = Settings(config=self.config).stream_config()
         capture = load_capture(self.capture, self.downscale, held_out(self.test_view))
@@ -74,7 +72,4 @@ class Sweep:
             table.add_row(*row)
         print_table(table)
         result.plot(plot)
-        for text in (result.sentence, result.toml.rstrip()):
-            if text:
-                print_result(text)
-        print_result(f"Results: {self.out / name}.json, {plot}")
+        print_result(f"{result.sentence}\n{result.toml}\nResults: {self.out / name}.json, {plot}")
