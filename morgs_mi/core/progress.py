@@ -71,7 +71,11 @@ class ProgressBar:
             return
         self._shown = moment
         share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
-        text = f"{share}, {timedelta(seconds=round(moment - self._begin))}"
+        seconds = moment - self._begin
+        text = f"{share}, {timedelta(seconds=round(seconds))}"
+        if total and 0 < done < total:
+            seconds_left = seconds * (total - done) / done
+            text += f", about {timedelta(seconds=round(seconds_left))} left"
         name = f"{self._title}: {self._stage}" if self._stage else self._title
         if is_notebook():
             from IPython.display import HTML, display  # type: ignore[import-not-found]

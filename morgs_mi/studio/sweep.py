@@ -41,7 +41,7 @@ from morgs_mi.evaluate.results import ViewScores, known_mean
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
 from morgs_mi.playback.stream_header import as_fitted
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.runs.fit_capture import push_frame, stream_capture
+from morgs_mi.runs.fit_capture import push_frame, stream_capture, with_points
 from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.studio.sweep_plot import draw_sweep
@@ -281,8 +281,12 @@ def fit_arms(
     frame = next(capture.partial_frames(0, 1))
 
     @cache
+    def dense_capture() -> Capture:
+        return with_points(capture, first_config.seed, Progress())
+
+    @cache
     def compile_kernels(config: StreamConfig) -> None:
-        loop = StreamLoop.of(capture, config)
+        loop = StreamLoop.of(dense_capture(), config)
         for frame in capture.partial_frames(0, _WARM_FRAMES):
             push_frame(loop, frame, capture.train_views)
 

@@ -30,6 +30,8 @@ _HEIGHT = 3.3  # of a panel
 # Least range of an axis of PSNR, dB, and least ratio of the ends of an axis of seconds.
 _LEAST_DB = 3.0
 _LEAST_RATIO = 6.0
+# Least distance of two names, as a share of the height of a panel.
+_DISTANCE = 0.08
 
 # Seconds and scores [P, S] of P points of a curve and S seeds, and a label of each point.
 Curve = tuple[np.ndarray, np.ndarray, Sequence[Any]]
@@ -58,8 +60,9 @@ def draw_sweep(result: Sweep) -> Figure:
     figure = Figure((_WIDTH, _HEIGHT * lines), layout="constrained")
     views = "held-out" if result.held_out else "training"
     seeds = len(result.first_frames)
-    title = f"{result.capture}, {views} views, {seeds} seeds (bars: standard deviation)"
-    figure.suptitle(title, parse_math=False)
+    title = f"{result.capture}, {views} views; numbers: epochs"
+    bars = f"; bars: standard deviation over {seeds} seeds"
+    figure.suptitle(title + bars * (seeds > 1), parse_math=False)
     for place, (title, curves) in enumerate(panels.items(), 1):
         draw_curves(figure.add_subplot(lines, 2, place), title, curves)
     return figure
@@ -82,6 +85,7 @@ def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
     low, high = axes.get_xlim()
     margin = max(_LEAST_RATIO * low / high, 1) ** 0.5
     axes.set_xlim(low / margin, high * margin)
+    axes.margins(y=0.15)
     low, high = axes.get_ylim()
     margin = max(_LEAST_DB - (high - low), 0) / 2
     low, high = (low - margin, high + margin) if title.endswith("dB") else (0, 1.05 * high)
@@ -89,9 +93,12 @@ def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
     axes.set_title(title, loc="left")
     axes.set_xlabel("seconds since its start" if title == _FIRST else "seconds of a later frame")
     axes.grid(color="0.9")
-    # Names beside the panel, in the order of the ends.
-    heights = np.linspace(0, 1, len(ends) + 2)[1:-1]
-    for height, (y, x, name, color) in zip(heights, sorted(ends), strict=True):
+    # Names beside the panel, in the order of the ends and apart from each other.
+    ends.sort()
+    shifts = _DISTANCE * np.arange(len(ends))
+    heights = (np.array([end[0] for end in ends]) - low) / (high - low) - shifts
+    heights = np.maximum.accumulate(np.minimum(heights, 1 - shifts[-1])) + shifts
+    for height, (y, x, name, color) in zip(heights, ends, strict=True):
         line = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
         place = (1.03, height)
         axes.annotate(

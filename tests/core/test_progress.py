@@ -24,7 +24,7 @@ def test_progress_bar__draws_on_a_terminal_and_ends_the_line(monkeypatch):
         bar(done, 4)
     lines = sys.stderr.getvalue().split("\r")
     assert lines[1].startswith("Evaluating")
-    assert "1/4, 0:00:00" in lines[1]
+    assert "1/4, 0:00:00, about 0:00:00 left" in lines[1]
     assert "━" * 30 + " 4/4" in lines[-1]
     assert lines[-1].endswith("\n")
     assert len(lines) == 3, "updates in quick succession are left out"

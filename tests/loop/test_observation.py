@@ -1,0 +1,26 @@
+"""Observations of a frame that follow from its images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from morgs_mi.loop.observation import ImageHistory, observe_frame, prepare
+from morgs_mi.method.objective import ObjectiveConfig
+from tests.scenes.recording import CONFIG, recording
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5])
+def test_observe_frame__has_masks_where_their_loss_has_a_weight(weight):
+    capture = recording()
+    fit = replace(CONFIG.fit, objective=ObjectiveConfig(mask_weight=weight))
+    config = replace(CONFIG, fit=fit, motion=replace(CONFIG.motion, mask_interval=1))
+    setup = prepare(capture.cameras, capture.points, capture.point_colors, config)
+    history = ImageHistory()
+    for frame in capture.partial_frames(0, 2):
+        observation = observe_frame(setup, frame.index, history, frame.images)
+        history = observation.history
+    assert observation.flows
+    for flow in observation.flows.values():
+        assert (flow.mask is None) == (weight == 0)
