@@ -61,6 +61,7 @@ class ProgressBar:
         self._stage = ""
         self._begin = time.monotonic()
         self._shown = -math.inf
+        self._first = math.inf
         self._output: Any = None
 
     def __call__(self, done: float, total: float | None = None) -> None:
@@ -73,8 +74,9 @@ class ProgressBar:
         share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
         seconds = moment - self._begin
         text = f"{share}, {timedelta(seconds=round(seconds))}"
-        if total and 0 < done < total:
-            seconds_left = seconds * (total - done) / done
+        self._first = min(done, self._first)  # what was done before is not part of the pace
+        if total and self._first < done < total:
+            seconds_left = seconds * (total - done) / (done - self._first)
             text += f", about {timedelta(seconds=round(seconds_left))} left"
         name = f"{self._title}: {self._stage}" if self._stage else self._title
         if is_notebook():
@@ -99,6 +101,7 @@ class ProgressBar:
         if stage != self._stage:
             self._begin = time.monotonic()
             self._shown = -math.inf
+            self._first = math.inf
             self._stage = stage
         self(done, total)
 

@@ -333,9 +333,9 @@ def fit_arms(
                 label = f"{name}-epochs{config.fit.epochs}-seed{seed}"
                 folder = out / label.replace(", ", "+").replace(" ", "-")
                 start = first if shares_first else None
-                fit = partial(_fit_later, capture, start, stage.report)
+                fit = partial(_fit_later, capture, start, stage)
                 scores[k, seed] = scores_of(folder, replace(config, seed=seed), curve, fit)
-                stage(1, 1)
+        fits(seeds * len(arms), seeds * len(arms))
     names, configs, _ = zip(*arms, strict=True)
     epochs = [config.fit.epochs for config in configs]
     return Sweep(capture.path.name, bool(capture.test_views), names, epochs, scores, first_frames)
@@ -344,7 +344,7 @@ def fit_arms(
 def _fit_later(
     capture: Capture,
     first: Path | None,
-    progress: Report | None,
+    progress: Progress,
     folder: Path,
     config: StreamConfig,
     metadata: dict[str, Any],
@@ -358,8 +358,9 @@ def _fit_later(
         rig = as_fitted(capture, stream)
         with Recording(FitFiles.of(folder), rig, stream.metadata | metadata) as recording:
             recording.push(packet, report, None)
-    stream_capture(capture, folder, config, first is not None, progress)
+    stream_capture(capture, folder, config, first is not None, progress.report)
     result = evaluate_stream(folder, capture.path)
+    progress(1, 1)
     later = ViewScores.mean([frame.scores for frame in result.frames[1:]])
     return [
         result.seconds.first,

@@ -70,7 +70,9 @@ def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path,
     assert document["scores"][3][1][2] == result.scores[3, 1, 2]
 
     monkeypatch.setattr(module, "stream_capture", interrupt)
-    again = sweep(*arguments)
+    states.clear()
+    again = sweep(*arguments, lambda *state: states.append(state))
+    assert states == [("Fitting and evaluating", 8, 8)], "fits that are there have no pace"
     np.testing.assert_array_equal(again.scores, result.scores)
     assert again.table == result.table
     with pytest.raises(KeyboardInterrupt):
