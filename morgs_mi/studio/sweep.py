@@ -157,7 +157,7 @@ def sweep(
     arms = []
     for preset in presets:
         method = config if preset == "default" else apply_preset(config, preset)
-        for count in epochs:
+        for count in sorted({*epochs}):
             arms.append((preset, replace(method, fit=replace(method.fit, epochs=count)), True))
     result = fit_arms(arms, config, capture, seeds, frames, Path(out), progress)
     table = [

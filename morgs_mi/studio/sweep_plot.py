@@ -34,7 +34,7 @@ _LEAST_RATIO = 6.0
 _DISTANCE = 0.08
 
 # Seconds and scores [P, S] of P points of a curve and S seeds, and a label of each point.
-Curve = tuple[np.ndarray, np.ndarray, Sequence[Any]]
+Curve = tuple[np.ndarray, np.ndarray, Sequence[Any] | np.ndarray]
 
 
 def draw_sweep(result: Sweep) -> Figure:
@@ -51,10 +51,9 @@ def draw_sweep(result: Sweep) -> Figure:
         if np.isfinite(result.scores[..., k]).any():
             panels[title] = {}
             for name in result.arms:
-                rows = [row for row, arm in enumerate(result.arms) if arm == name]
-                rows.sort(key=lambda row: result.epochs[row])
+                rows = np.flatnonzero(np.array(result.arms) == name)
                 x, y = result.scores[rows][..., [1, k]].transpose(2, 0, 1)
-                panels[title][name] = x, y, [result.epochs[row] for row in rows]
+                panels[title][name] = x, y, np.array(result.epochs)[rows]
     panels[_FIRST] = {"first frame": (*np.transpose(result.first_frames, (2, 1, 0)), ())}
     lines = -(-len(panels) // 2)
     figure = Figure((_WIDTH, _HEIGHT * lines), layout="constrained")

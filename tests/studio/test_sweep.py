@@ -39,7 +39,7 @@ def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path,
     arguments = (capture, ("default", "baseline"), (2, 1), 2, 2, out, QUICK)
     result = sweep(*arguments, lambda *state: states.append(state))
     assert [*result.arms] == ["default"] * 2 + ["baseline"] * 2
-    assert [*result.epochs] == [2, 1, 2, 1]
+    assert [*result.epochs] == [1, 2, 1, 2]
     assert {(stage, total) for stage, _, total in states} == {("Fitting and evaluating", 8)}
     assert states[-1][1] == 8
 
