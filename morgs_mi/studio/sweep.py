@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
+from textwrap import shorten
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -72,8 +73,8 @@ _FIRST_PARTS = {"density control", "SH above 0", "exposure"}
 # The first frame and two later ones, with masks, compile the kernels of an arm.
 _WARM_FRAMES = 3
 _WARM = {"fit": {"first_frame_steps": 60, "epochs": 2}, "motion": {"mask_interval": 1}}
-# Share by which the motion error may grow without a part that is not needed.
-_MOTION_TOLERANCE = 0.05
+# Share by which seconds, motion error and bytes may grow without a part that is not needed.
+_COST_TOLERANCE = 0.05
 
 
 # Name, settings, and whether the arm continues the first frame that most share.
@@ -181,7 +182,8 @@ def leave_out(
     without all together that it does not need.
 
     A part is not needed if, without it, the PSNR of the images and that of their moving pixels fall
-    by at most `tolerance` and the motion error rises by at most 5 %, in the mean over the seeds.
+    by at most `tolerance`, and the motion error, the seconds and the bytes of a later frame rise by
+    at most 5 %, in the mean over the seeds.
     Parts may stand in for each other: while those that are not needed alone are needed together,
     the one that costs most PSNR stays in.
 
@@ -224,7 +226,8 @@ def leave_out(
     changes = result.scores - result.scores[:1]
     table = [["", *TITLES, "needed"], [result.arms[0], *_cells(result.scores[0]), ""]]
     for k in range(1, len(changes)):
-        table.append([result.arms[k], *_cells(changes[k], "+"), "yes" if needed[k] else "no"])
+        name = shorten(result.arms[k], 40)
+        table.append([name, *_cells(changes[k], "+"), "yes" if needed[k] else "no"])
     sentence = f"Within {tolerance:g} dB, this scene needs each of the parts."
     if left_out:
         k = result.arms.index(without(left_out)[0])
@@ -244,7 +247,9 @@ def _are_needed(result: Sweep, tolerance: float) -> np.ndarray:
     means = result.scores.mean(1)
     changes = means - means[0]
     loss = -np.fmin(changes[:, 2], changes[:, 3])
-    return (loss > tolerance) | (changes[:, 4] > _MOTION_TOLERANCE * means[0, 4])
+    costs = [1, 4, 5]
+    # Comparisons with unknown scores are false.
+    return (loss > tolerance) | (changes[:, costs] > _COST_TOLERANCE * means[0, costs]).any(1)
 
 
 def _toml(parts: Sequence[str]) -> str:

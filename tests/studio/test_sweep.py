@@ -101,47 +101,46 @@ def test_leave_out__parts_of_the_first_frame_have_their_own(tmp_path, monkeypatc
     assert (out / "leave-out.png").stat().st_size > 10_000
 
 
-def fake_fits(losses):
-    """Return a function in place of `fit_arms`: the PSNR that each arm loses, and the motion error
-    that it adds, for the parts that it lacks.
+def fake_fits(changes):
+    """Return a function in place of `fit_arms`: the scores change by what the parts that an arm
+    lacks make of them.
     """
 
     def fit_arms(arms, *_):
         scores = np.ones((len(arms), 2, len(TITLES)))
         for k, (name, *_) in enumerate(arms[1:], 1):
-            scores[k, :, 2:5] += losses(name.removeprefix("without ").split(", "))
+            scores[k] += changes(name.removeprefix("without ").split(", "))
         names = [name for name, *_ in arms]
         return Sweep("clip", True, names, [8] * len(arms), scores, [[(1.0, 20.0), (2.0, 21.0)]] * 2)
 
     return fit_arms
 
 
-def without_any(parts):
-    return np.zeros(3)
+def without_changes(parts):
+    return np.zeros(len(TITLES))
 
 
-def without_search_or_offset(parts):
-    """Search and propagation stand in for each other, the moving pixels need the offset, and the
-    motion needs the flow guidance.
+def with_changes(parts):
+    """Search and propagation stand in for each other, the moving pixels need the offset, the motion
+    the flow guidance, the time the active set and the size the exposure.
     """
     lost = {"search", "propagation"} <= {*parts}
-    return np.array(
-        [
-            -1.0 * lost - 0.01 * ("search" in parts),
-            -1.0 * ("offset" in parts),
-            "flow guidance" in parts,
-        ]
-    )
+    needs = [part in parts for part in ("active set", "offset", "flow guidance", "exposure")]
+    seconds, moving, motion, size = np.array(needs, float)
+    return np.array([0, seconds, -1.0 * lost - 0.01 * ("search" in parts), -moving, motion, size])
 
 
 @pytest.mark.parametrize(
-    ("losses", "needed"),
-    [(without_any, set()), (without_search_or_offset, {"flow guidance", "offset", "search"})],
+    ("changes", "needed"),
+    [
+        (without_changes, set()),
+        (with_changes, {"flow guidance", "offset", "search", "active set", "exposure"}),
+    ],
 )
 def test_leave_out__finds_the_parts_that_are_not_needed_together(
-    tmp_path, monkeypatch, losses, needed
+    tmp_path, monkeypatch, changes, needed
 ):
-    monkeypatch.setattr(module, "fit_arms", fake_fits(losses))
+    monkeypatch.setattr(module, "fit_arms", fake_fits(changes))
     result = leave_out(None, out=tmp_path)
     left_out = [part for part in PARTS if part not in needed]
     assert ", ".join(left_out) in result.sentence
@@ -150,12 +149,13 @@ def test_leave_out__finds_the_parts_that_are_not_needed_together(
         (tmp_path / "part.toml").write_text(text)
         applied = apply_values(config, read_config(tmp_path / "part.toml"))
         assert (applied == config) == (part in left_out)
-    rows = {row[0].removeprefix("without "): row[-1] for row in result.table[2:]}
-    assert rows[", ".join(left_out)] == "no"
+    needed_alone = [row[-1] == "yes" for row in result.table[2:-1]]
+    assert needed_alone == [part in needed - {"search"} for part in PARTS]
+    assert result.table[-1][-1] == "no"
 
 
 def test_leave_out__may_find_that_all_parts_are_needed(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "fit_arms", fake_fits(lambda parts: np.full(3, -9)))
+    monkeypatch.setattr(module, "fit_arms", fake_fits(lambda parts: np.full(6, -9)))
     result = leave_out(None, out=tmp_path)
     assert "needs each of the parts" in result.sentence
     assert result.toml == ""
