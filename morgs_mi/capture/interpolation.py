@@ -28,11 +28,8 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
 
     Args:
         first: [H, W, 3], RGB: uint8, or float32 of linear light.
-        second: likewise, of the same type.
+        second: likewise, of the same size and type.
         share: in [0, 1]; 0 for the first frame, 1 for the second.
-
-    Raises:
-        ValueError: the images are not RGB or differ in size.
     """
     has_light = first.dtype != np.uint8
     if has_light:

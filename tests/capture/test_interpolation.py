@@ -54,8 +54,3 @@ def test_image_between__shows_things_where_they_have_moved_to(share: float) -> N
 def test_image_between__is_a_frame_at_either_end(share: float) -> None:
     frames = moving_square(0), moving_square(4)
     np.testing.assert_allclose(image_between(*frames, share).astype(int), frames[share], atol=1)
-
-
-def test_image_between__refuses_images_of_different_sizes() -> None:
-    with pytest.raises(ValueError, match="must be RGB of one size"):
-        image_between(np.zeros((40, 40, 3), np.uint8), np.zeros((40, 41, 3), np.uint8), 0.5)
