@@ -82,7 +82,7 @@ Arm = tuple[str, StreamConfig, bool]
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class SweepResult:
     """Scores of fits of a capture by several arms. In a notebook it is a table and a plot."""
 
     capture: str  #: Name of the capture.
@@ -132,7 +132,7 @@ def sweep(
     out: str | Path = "sweep",
     config: StreamConfig | None = None,
     progress: Report | None = None,
-) -> Sweep:
+) -> SweepResult:
     """Fit and evaluate a capture with each preset, number of epochs and seed: error against run
     time.
 
@@ -177,7 +177,7 @@ def leave_out(
     out: str | Path = "sweep",
     config: StreamConfig | None = None,
     progress: Report | None = None,
-) -> Sweep:
+) -> SweepResult:
     """Fit and evaluate a capture without each of the `PARTS` of the method that `config` uses, and
     without all together that it does not need.
 
@@ -242,7 +242,7 @@ def leave_out(
     return _written(result, Path(out) / "leave-out.json", table, sentence, toml)
 
 
-def _are_needed(result: Sweep, tolerance: float) -> np.ndarray:
+def _are_needed(result: SweepResult, tolerance: float) -> np.ndarray:
     """Return, for each arm, whether the parts that it lacks are needed; see `leave_out`."""
     means = result.scores.mean(1)
     changes = means - means[0]
@@ -276,7 +276,7 @@ def fit_arms(
     frames: int,
     out: Path,
     progress: Report | None,
-) -> Sweep:
+) -> SweepResult:
     """Return the scores of some arms, fitted where they are missing. They are fitted seed by seed,
     so that a change of the machine's load reaches all of them.
     """
@@ -343,7 +343,9 @@ def fit_arms(
         fits(seeds * len(arms), seeds * len(arms))
     names, configs, _ = zip(*arms, strict=True)
     epochs = [config.fit.epochs for config in configs]
-    return Sweep(capture.path.name, bool(capture.test_views), names, epochs, scores, first_frames)
+    return SweepResult(
+        capture.path.name, bool(capture.test_views), names, epochs, scores, first_frames
+    )
 
 
 def _fit_later(
@@ -378,8 +380,12 @@ def _fit_later(
 
 
 def _written(
-    result: Sweep, path: Path, table: Sequence[Sequence[str]], sentence: str = "", toml: str = ""
-) -> Sweep:
+    result: SweepResult,
+    path: Path,
+    table: Sequence[Sequence[str]],
+    sentence: str = "",
+    toml: str = "",
+) -> SweepResult:
     """Return a result with its table, and write it as JSON with machine and versions."""
     result = replace(result, table=table, sentence=sentence, toml=toml)
     entries = {"titles": TITLES, "scores": result.scores.tolist()}

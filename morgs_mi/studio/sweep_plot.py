@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from morgs_mi.studio.sweep import Sweep
+    from morgs_mi.studio.sweep import SweepResult
 
 # Of Okabe and Ito, which readers with any vision of colours distinguish.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -37,7 +37,7 @@ _DISTANCE = 0.08
 Curve = tuple[np.ndarray, np.ndarray, Sequence[Any] | np.ndarray]
 
 
-def draw_sweep(result: Sweep) -> Figure:
+def draw_sweep(result: SweepResult) -> Figure:
     """Return the plot of a sweep: the scores over the seconds of a later frame, a curve for each
     arm, and the PSNR of the first frame over the seconds since its fit began.
 

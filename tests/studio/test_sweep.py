@@ -18,7 +18,7 @@ from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.studio import sweep as module
-from morgs_mi.studio.sweep import PARTS, TITLES, Sweep, leave_out, sweep
+from morgs_mi.studio.sweep import PARTS, TITLES, SweepResult, leave_out, sweep
 from morgs_mi.studio.sweep_plot import draw_curves
 from tests.cli.commands import assert_refused, interrupt
 from tests.cli.conftest import run
@@ -111,7 +111,9 @@ def fake_fits(changes):
         for k, (name, *_) in enumerate(arms[1:], 1):
             scores[k] += changes(name.removeprefix("without ").split(", "))
         names = [name for name, *_ in arms]
-        return Sweep("clip", True, names, [8] * len(arms), scores, [[(1.0, 20.0), (2.0, 21.0)]] * 2)
+        return SweepResult(
+            "clip", True, names, [8] * len(arms), scores, [[(1.0, 20.0), (2.0, 21.0)]] * 2
+        )
 
     return fit_arms
 
@@ -166,7 +168,7 @@ def test_sweep__is_a_table_and_a_plot_in_a_notebook():
     scores = np.array([[[9.0, 1, 30, np.nan, np.nan, 5]], [[9.0, 2, 31, np.nan, np.nan, 6]]])
     curves = [[(1.0, 20.0), (2.0, 21.0)]]
     table = [["arm", "kB"], ["<default>", "5"]]
-    text = Sweep("clip", True, ["default"] * 2, [1, 2], scores, curves, table)._repr_html_()
+    text = SweepResult("clip", True, ["default"] * 2, [1, 2], scores, curves, table)._repr_html_()
     assert "<td>arm<td>kB<tr><td>&lt;default&gt;<td>5</table>" in text
     assert "data:image/png;base64,iVBOR" in text
 
