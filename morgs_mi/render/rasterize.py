@@ -168,9 +168,9 @@ def rasterize(
     sizes = {**channel_sizes(), "alpha": 1}
     view = cameras[0]
     if features is not None:
-        rows = float_tensor("rasterize()", "features", features)
-        features = rows
-        sizes["features"] = int(rows.shape[1])
+        table = float_tensor("rasterize()", "features", features)
+        features = table
+        sizes["features"] = int(table.shape[1])
         channels = (*channels, "features")
     limits = None
     if depth_limit is not None:  # finite: a limit at infinity is one beyond all Gaussians
