@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from math import log
+
 import drjit as dr
 import mitsuba as mi
 
@@ -19,6 +21,7 @@ _EXP2 = (
     0.6931217908859253,
     0.9999992847442627,
 )
+_LN2 = log(2.0)
 
 
 def on_cpu() -> bool:
@@ -88,11 +91,13 @@ def exp2(p: Float) -> Float:
     Adding 1.5 * 2^23 rounds to an integer in the low mantissa bits, which is then shifted into the
     exponent.
     """
-    total = p + 12582912.0
-    f = p - (total - 12582912.0)
+    x = dr.detach(p)
+    total = x + 12582912.0
+    f = x - (total - 12582912.0)
     value = mi.Float(_EXP2[0])
     for coefficient in _EXP2[1:]:
         value = dr.fma(value, f, coefficient)
     exponent = dr.reinterpret_array(mi.Int32, total) << 23  # pyright: ignore[reportOperatorIssue]
     bits = dr.reinterpret_array(mi.Int32, value) + exponent
-    return dr.reinterpret_array(mi.Float, bits)
+    power = dr.reinterpret_array(mi.Float, bits)
+    return dr.replace_grad(power, _LN2 * power * p) if dr.grad_enabled(p) else power

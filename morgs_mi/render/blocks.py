@@ -117,17 +117,15 @@ def next_entry(
     The word is 0 where none is left.
     """
 
-    def step(place, word, base, end, words):
-        return place + 32, dr.gather(mi.UInt32, words, place), base + 32, end, words
+    def step(place, word, base):
+        return place + 32, dr.gather(mi.UInt32, words, place), base + 32
 
-    state = (place, word, base, end, words)
-    result = dr.while_loop(
-        state,
-        lambda place, word, base, end, _: (word == 0) & (place < end),
+    return dr.while_loop(
+        (place, word, base),
+        lambda place, word, base: (word == 0) & (place < end),
         step,
         label="next word",
     )
-    return result[:3]
 
 
 def pack_records(columns: list[Float], order: UInt32) -> Float:
@@ -239,46 +237,23 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     depth_order_at = dr.empty(mi.UInt32, total)
     across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
 
-    def enter(
-        place, end, column, tile, columns, depth_order, across, slot_of, slot_at, depth_order_at
-    ):
-        slot = tile if region.whole else dr.gather(mi.UInt32, slot_of, tile)
+    depth_order = dr.arange(mi.UInt32, N)
+    mode = dr.ReduceMode.NoConflicts
+
+    def enter(place, column, tile, slot_at, depth_order_at):
+        slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
         is_drawn = region.whole or slot != NO_SLOT
-        dr.scatter(slot_at, slot, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(
-            depth_order_at, depth_order, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts
-        )
+        dr.scatter(slot_at, slot, place, active=is_drawn, mode=mode)
+        dr.scatter(depth_order_at, depth_order, place, active=is_drawn, mode=mode)
         place = place + 1 if region.whole else dr.select(is_drawn, place + 1, place)
         wrap = column + 1 == columns
         column = dr.select(wrap, 0, column + 1)
         tile = dr.select(wrap, tile + across + 1 - columns, tile + 1)
-        return (
-            place,
-            end,
-            column,
-            tile,
-            columns,
-            depth_order,
-            across,
-            slot_of,
-            slot_at,
-            depth_order_at,
-        )
+        return place, column, tile, slot_at, depth_order_at
 
-    state = (
-        end - counts,
-        end,
-        mi.UInt32(0),
-        y0 * across + x0,
-        columns,
-        dr.arange(mi.UInt32, N),
-        across,
-        region.slot_of,
-        slot_at,
-        depth_order_at,
-    )
+    state = (end - counts, mi.UInt32(0), y0 * across + x0, slot_at, depth_order_at)
     *_, slot_at, depth_order_at = dr.while_loop(
-        state, lambda place, end, *_: place < end, enter, label="tile entries"
+        state, lambda place, *_: place < end, enter, label="tile entries"
     )
     dr.eval(slot_at, depth_order_at)
 
@@ -478,8 +453,9 @@ def _transposed(rows: list[UInt32]) -> list[UInt32]:
 def _set_bits(words: UInt32, begin: UInt32, end: UInt32) -> UInt32:
     """Return the number of set bits in every block's words."""
 
-    def add(place, count, end, words):
-        return place + 32, count + dr.popcnt(dr.gather(mi.UInt32, words, place)), end, words
+    def add(place, count):
+        return place + 32, count + dr.popcnt(dr.gather(mi.UInt32, words, place))
 
-    state = (begin, mi.UInt32(0), end, words)
-    return dr.while_loop(state, lambda place, count, end, _: place < end, add, label="set bits")[1]
+    return dr.while_loop(
+        (begin, mi.UInt32(0)), lambda place, count: place < end, add, label="set bits"
+    )[1]

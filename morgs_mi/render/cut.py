@@ -106,12 +106,3 @@ class Cut:
             for first, total in ((self.dx[0], column), (self.dy[0], row))
         ]
         return [-self.gx * dz, -self.gy * dz], [dz, *slopes, behind]
-
-    def tangent(self, k: int, cut: CutAlpha, mean: list[Float], profile: list[Float]) -> Float:
-        """Return the change of alpha' at pixel k along tangents of (mean_x, mean_y) and the
-        profile.
-        """
-        j, i = divmod(k, len(self.dx))
-        tz, t_gx, t_gy, t_r = profile
-        change = tz + t_gx * self.dx[i] + t_gy * self.dy[j] - self.gx * mean[0] - self.gy * mean[1]
-        return cut.by_q * (cut.behind * t_r - self.r_sigma * change)

@@ -138,17 +138,15 @@ class _Block:
     """
 
     def __init__(self, layout: Layout, blocks: Blocks) -> None:
-        config = layout.config
         is_block = blocks.order != NO_SLOT
 
         def of_lane(values: UInt32) -> UInt32:
             return dr.gather(mi.UInt32, values, blocks.order, is_block)
 
-        self.width, self.height = block_shape(config)
+        self.layout = layout
+        self.blocks = blocks
+        self.width, self.height = block_shape(layout.config)
         self.area = self.width * self.height
-        self.log_min = log2(config.alpha_min)
-        self.alpha_max = config.alpha_max
-        self.stop = config.stop_transmittance
         self.place = of_lane(blocks.place)
         self.rows = of_lane(blocks.rows)
         self.pitch = dr.gather(mi.UInt32, blocks.pitch, mi.UInt32(0))
@@ -164,6 +162,17 @@ class _Block:
         # One word before the block's first, as `next_entry` expects.
         self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
 
+    def advance(
+        self, walk: tuple[UInt32, UInt32, UInt32]
+    ) -> tuple[UInt32, tuple[UInt32, UInt32, UInt32]]:
+        """Return the depth order at a lane's current entry, and the walk advanced to the next
+        entry.
+        """
+        place, word, base = walk
+        depth_order = dr.gather(mi.UInt32, self.blocks.entries, base + dr.tzcnt(word))
+        next_walk = next_entry(place, word & (word - 1), base, self.end, self.blocks.words)
+        return depth_order, next_walk
+
     def continues(self, walk: tuple[UInt32, UInt32, UInt32], T: list[Float]) -> Bool:
         """Return whether a lane continues: entries are left, and its most transparent pixel is
         above the stop.
@@ -171,7 +180,7 @@ class _Block:
         while len(T) > 1:
             pairs = zip(T[::2], T[1::2], strict=False)
             T = [dr.select(a > b, a, b) for a, b in pairs] + T[len(T) & ~1 :]
-        return (walk[1] != 0) & (T[0] >= self.stop)
+        return (walk[1] != 0) & (T[0] >= self.layout.config.stop_transmittance)
 
     def packets(self, size: int) -> list[tuple[UInt32, Bool]]:
         """Return (place, in the image) of all packets of 4 in an image of `size` floats per pixel,
@@ -181,13 +190,17 @@ class _Block:
         starts = [((self.place + j * self.pitch) * size, self.rows > j) for j in range(self.height)]
         return [(start + k, valid) for start, valid in starts for k in range(run)]
 
-    def offsets(self, x: Float, y: Float, geometry: list[Float]) -> tuple[list[Float], list[Float]]:
+    def offsets(self, geometry: list[Float]) -> tuple[list[Float], list[Float]]:
         """Return the offsets dx [width] and dy [height] of the block's columns and rows from the
         mean.
         """
-        dx = x - geometry[0]
-        dy = y - geometry[1]
+        dx = self.x - geometry[0]
+        dy = self.y - geometry[1]
         return [dx + i for i in range(self.width)], [dy + j for j in range(self.height)]
+
+    def cut(self, geometry: list[Float], dx: list[Float], dy: list[Float]) -> Cut | None:
+        """Return the cut by the depth limits of the pixels; None without depth limits."""
+        return Cut(geometry[_SHAPE:], dx, dy, self.limits) if self.layout.cut else None
 
     def powers(
         self, dx: list[Float], dy: list[Float], geometry: list[Float]
@@ -207,19 +220,20 @@ class _Block:
 
     def alpha(self, p: Float) -> tuple[Float, Float]:
         """Return (alpha, alpha before the cap and the cut-off)."""
+        config = self.layout.config
         full = exp2(p)
         # One instruction; `dr.minimum` takes three to handle NaN.
-        value = dr.select(full < self.alpha_max, full, self.alpha_max)
-        return dr.select(p >= self.log_min, value, 0), full
+        value = dr.select(full < config.alpha_max, full, config.alpha_max)
+        return dr.select(p >= log2(config.alpha_min), value, 0), full
 
-
-def _advance(
-    walk: tuple[UInt32, UInt32, UInt32], end: UInt32, words: UInt32, entries: UInt32
-) -> tuple[UInt32, tuple[UInt32, UInt32, UInt32]]:
-    """Return the depth order at a lane's current entry, and the walk advanced to the next entry."""
-    place, word, base = walk
-    depth_order = dr.gather(mi.UInt32, entries, base + dr.tzcnt(word))
-    return depth_order, next_entry(place, word & (word - 1), base, end, words)
+    def weights(self, geometry: list[Float], T: list[Float]) -> list[Float]:
+        """Return the blend weight w of every pixel, row by row."""
+        dx, dy = self.offsets(geometry)
+        cut = self.cut(geometry, dx, dy)
+        alphas = [self.alpha(p)[0] for p, _ in self.powers(dx, dy, geometry)]
+        if cut:
+            alphas = [cut.alpha(k, alpha).alpha for k, alpha in enumerate(alphas)]
+        return [alpha * t for alpha, t in zip(alphas, T, strict=True)]
 
 
 def _floats(count: int, value: float = 0.0) -> list[Float]:
@@ -271,30 +285,19 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
     G = layout.geometry
     C = layout.columns
 
-    def body(walk, end, x, y, limits, T, sums, records, words, entries):
-        depth_order, walk = _advance(walk, end, words, entries)
+    def body(walk, T, sums):
+        depth_order, walk = block.advance(walk)
         record = fetch_record(records, depth_order, G + C)
-        geometry = record[:G]
-        values = record[G:]
-        dx, dy = block.offsets(x, y, geometry)
-        cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
-        T_next = []
-        sums_next = []
-        for k, (p, _) in enumerate(block.powers(dx, dy, geometry)):
-            alpha, _ = block.alpha(p)
-            w = (cut.alpha(k, alpha).alpha if cut else alpha) * T[k]
-            T_next.append(T[k] - w)
-            sums_next.append(
-                [dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)]
-            )
-        return walk, end, x, y, limits, T_next, sums_next, records, words, entries
+        weights = block.weights(record[:G], T)
+        sums = [
+            [dr.fma(w, c, total) for c, total in zip(record[G:], row, strict=True)]
+            for w, row in zip(weights, sums, strict=True)
+        ]
+        return walk, [t - w for t, w in zip(T, weights, strict=True)], sums
 
-    T = _floats(block.area, 1.0)
-    sums = [_floats(C) for _ in range(block.area)]
-    walk = (block.walk, block.end, block.x, block.y, block.limits)
-    state = (*walk, T, sums, records, blocks.words, blocks.entries)
-    *_, T, sums, _, _, _ = dr.while_loop(
-        state, lambda walk, end, x, y, limits, T, *_: block.continues(walk, T), body, label="blend"
+    state = (block.walk, _floats(block.area, 1.0), [_floats(C) for _ in range(block.area)])
+    _, T, sums = dr.while_loop(
+        state, lambda walk, T, _: block.continues(walk, T), body, label="blend"
     )
     return _store(block, layout, sums, [1 - t for t in T], images)
 
@@ -339,13 +342,13 @@ def adjoint(
         for g, v in zip(gradients, _load(block, layout, images), strict=True)
     ]
 
-    def body(walk, end, x, y, limits, T, S, g, records, words, entries, first_record, sums):
-        depth_order, walk = _advance(walk, end, words, entries)
+    def body(walk, T, S, sums):
+        depth_order, walk = block.advance(walk)
         record = fetch_record(records, depth_order, G + C)
         geometry = record[:G]
         values = record[G:]
-        dx, dy = block.offsets(x, y, geometry)
-        cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
+        dx, dy = block.offsets(geometry)
+        cut = block.cut(geometry, dx, dy)
         T_next = []
         S_next = []
         value_grads = _floats(C)
@@ -355,11 +358,11 @@ def adjoint(
             part = cut.alpha(k, alpha) if cut else None
             w = (part.alpha if part else alpha) * T[k]
             value_grads = [
-                dr.fma(w, g_c, total) for g_c, total in zip(g[k], value_grads, strict=False)
+                dr.fma(w, g_c, total) for g_c, total in zip(gradients[k], value_grads, strict=False)
             ]
             T_next.append(T[k] - w)
             if geometric:
-                gc = _inner(g[k], values, layout, None)
+                gc = _inner(gradients[k], values, layout, None)
                 s = dr.fma(-w, gc, S[k])
                 S_next.append(s)
                 if cut and part:
@@ -368,7 +371,7 @@ def adjoint(
                     d = alpha * part.by_alpha * d_alpha
                 else:
                     d = dr.fma(w, gc, -alpha * s * dr.rcp(1 - alpha))
-                moments.add(k, dr.select(full <= block.alpha_max, d, 0), u)
+                moments.add(k, dr.select(full <= layout.config.alpha_max, d, 0), u)
         geometry_grads = moments.gradients(dx[0], dy[0], geometry) if geometric else _floats(G)
         if cut and geometric:
             mean_grads, profile_grads = cut.gradients()
@@ -380,20 +383,12 @@ def adjoint(
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
             place = (first_record + depth_order) * packets + k
             dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, place, mode=mode)
-        next_state = (walk, end, x, y, limits, T_next, S_next, g, records, words, entries)
-        return *next_state, first_record, sums
+        return walk, T_next, S_next, sums
 
-    T = _floats(block.area, 1.0)
-    suffix = suffix if geometric else []
-    walk = (block.walk, block.end, block.x, block.y, block.limits)
-    lists = (records, blocks.words, blocks.entries)
-    *_, sums = dr.while_loop(
-        (*walk, T, suffix, gradients, *lists, first_record, sums),
-        lambda walk, end, x, y, limits, T, *_: block.continues(walk, T),
-        body,
-        label="blend (adjoint)",
-    )
-    return sums
+    state = (block.walk, _floats(block.area, 1.0), suffix if geometric else [], sums)
+    return dr.while_loop(
+        state, lambda walk, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
+    )[-1]
 
 
 def _inner(g: list[Float], values: list[Float], layout: Layout, alpha: Float | None) -> Float:
@@ -466,68 +461,35 @@ def tangent(
     G = layout.geometry
     C = layout.columns
 
-    def body(walk, end, x, y, limits, T, dT, dsums, records, tangents, words, entries):
-        depth_order, walk = _advance(walk, end, words, entries)
+    def body(walk, T, dT, dsums):
+        depth_order, walk = block.advance(walk)
         record, tangent = (fetch_record(r, depth_order, G + C) for r in (records, tangents))
-        geometry = record[:G]
-        values = record[G:]
-        a, b, c = geometry[2:5]
-        tx, ty, ta, tb, tc, t_log2 = tangent[:_SHAPE]
-        dx, dy = block.offsets(x, y, geometry)
-        cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
-        T_next = []
-        dT_next = []
-        dsums_next = []
-        for k, (p, u) in enumerate(block.powers(dx, dy, geometry)):
-            px = dx[k % block.width]
-            py = dy[k // block.width]
-            alpha, full = block.alpha(p)
-            tu = ta * px + tb * py - a * tx - b * ty
-            tv = tc * py - c * ty
-            tp = t_log2 - 2 * (u * tu + c * py * tv)
-            t_alpha = dr.select(full <= block.alpha_max, _LN2 * alpha * tp, 0)
-            if cut:
-                part = cut.alpha(k, alpha)
-                along = cut.tangent(k, part, [tx, ty], tangent[_SHAPE:G])
-                alpha = part.alpha
-                t_alpha = dr.fma(part.by_alpha, t_alpha, along)
-            w = alpha * T[k]
-            tw = dr.fma(t_alpha, T[k], alpha * dT[k])
-            T_next.append(T[k] - w)
-            dT_next.append(dT[k] - tw)
-            dsums_next.append(
-                [
-                    dr.fma(w, tangent[G + i], dr.fma(tw, values[i], total) if attached else total)
-                    for i, (total, attached) in enumerate(
-                        zip(dsums[k], layout.attached, strict=True)
-                    )
-                ]
-            )
-        return (
-            walk,
-            end,
-            x,
-            y,
-            limits,
-            T_next,
-            dT_next,
-            dsums_next,
-            records,
-            tangents,
-            words,
-            entries,
-        )
+        with dr.resume_grad():
+            inputs = [mi.Float(v) for v in (*record, *T)]
+            dr.enable_grad(inputs)
+            dr.set_grad(inputs, [*tangent, *dT])
+            values = inputs[G : G + C]
+            T = inputs[G + C :]
+            weights = block.weights(inputs[:G], T)
+            blended = [
+                (w if attached else dr.detach(w)) * c
+                for w in weights
+                for c, attached in zip(values, layout.attached, strict=True)
+            ]
+            T = [t - w for t, w in zip(T, weights, strict=True)]
+            *change, dT = dr.forward_to(blended, T)
+        changes = iter(*change)
+        dsums = [[total + next(changes) for total in row] for row in dsums]
+        return walk, dr.detach(T), dT, dsums
 
-    dsums = [_floats(C) for _ in range(block.area)]
-    T = _floats(block.area, 1.0)
-    dT = _floats(block.area)
-    walk = (block.walk, block.end, block.x, block.y, block.limits)
-    state = (*walk, T, dT, dsums, records, tangents, blocks.words, blocks.entries)
-    _, _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
-        state,
-        lambda walk, end, x, y, limits, T, *_: block.continues(walk, T),
-        body,
-        label="blend (tangent)",
+    state = (
+        block.walk,
+        _floats(block.area, 1.0),
+        _floats(block.area),
+        [_floats(C) for _ in range(block.area)],
+    )
+    _, _, dT, dsums = dr.while_loop(
+        state, lambda walk, T, *_: block.continues(walk, T), body, label="blend (tangent)"
     )
     return _store(
         block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], images
