@@ -144,7 +144,8 @@ def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
         color = image.color * weight
         confidence = image.confidence * weight
         dr.backward(dr.sum(dr.square(color), axis=None) + dr.sum(confidence, axis=None))
-        colors = {"color": region.paste(np.array(dr.detach(color)), np.zeros((*mask.shape[:2], 3)))}
+        image_color = region.uncropped(np.array(dr.detach(color)))
+        colors = {"color": image_color[: mask.shape[0], : mask.shape[1]]}
         return colors | {f"gradient of {name}": dr.grad(getattr(gaussians, name)) for name in RAW}
 
     assert_variants_agree(run)

@@ -37,7 +37,6 @@ from morgs_mi.method.ssim_layout import (
     STRIP,
     Lanes,
     Planes,
-    Runs,
     packet_type,
     read_packet,
     write_packet,
@@ -58,8 +57,9 @@ _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
 class _Windows:
     """The windows that pixels of a region lie in, and the target's statistics there."""
 
-    windows: Runs  # runs of the centres of the windows
-    pixels: Runs  # runs of the pixels
+    windows: Lanes  # runs of the centres of the windows
+    count: int  # of the windows, one for each colour
+    pixels: Lanes  # runs of the pixels
     mean: Float  # planes of M y, defined on `windows`
     variance: Float  # planes of M yy - (M y)^2, likewise
 
@@ -136,12 +136,13 @@ class Target:
         None.
         """
         if region not in self._windows:
-            windows, pixels = (self.planes.runs(region, reach) for reach in (RADIUS, 0))
+            windows, count = self.planes.runs(region, RADIUS)
+            pixels, _ = self.planes.runs(region, 0)
             height = dr.opaque(mi.Int32, self.planes.height)
             (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(
-                windows.lanes, height, self.pixels
+                windows, height, self.pixels
             )
-            self._windows[region] = _Windows(windows, pixels, mean, variance)
+            self._windows[region] = _Windows(windows, count, pixels, mean, variance)
         return self._windows[region]
 
     def masked(self, values: Float, places: UInt32 | None = None) -> Float:
@@ -174,11 +175,11 @@ class Recon(dr.CustomOp):
         scale = dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
         height = dr.opaque(mi.Int32, planes.height)
         dr.eval(image)
-        arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
+        arguments = (on.windows, height, image, target.pixels, on.mean, on.variance)
         derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
-        arguments = (on.pixels.lanes, height, image, target.pixels, derivatives, scale)
+        arguments = (on.pixels, height, image, target.pixels, derivatives, scale)
         (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
-        structure = dr.opaque(mi.Float, on.windows.num_pixels) - dr.sum(ssim)
+        structure = dr.opaque(mi.Float, on.count) - dr.sum(ssim)
         loss = scale * ((1 - weight) * dr.sum(error) + weight * structure)
         if places is None:
             self.gradient = planes.image(target.masked(gradient))
@@ -312,12 +313,12 @@ def _walk(
     packet = packet_type()
     targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
 
-    def blurred(row: Int32, height: Int32, places: tuple[UInt32, UInt32, UInt32]) -> Jit:
+    def blurred(row: Int32) -> Jit:
         valid = (row >= 0) & (row < height)
         down = mi.UInt32(row) * COLUMN
 
         def wide(plane: Float) -> list[Float]:
-            numbers = [v for place in places for v in read_packet(plane, place + down, valid)]
+            numbers = [v for place in lanes.places for v in read_packet(plane, place + down, valid)]
             return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
 
         sums = []
@@ -329,21 +330,21 @@ def _walk(
             sums += list(total)
         return packet(sums)
 
-    def body(row, end, first, places, columns, height, windows, total, targets):
+    def body(row, windows, total, targets):
         # Two rows per turn: the windows are read and written half as often. Window k ends k rows
         # further down.
-        a = blurred(row, height, places)
-        b = blurred(row + 1, height, places)
+        a = blurred(row)
+        b = blurred(row + 1)
         w = _TAPS
         done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
         windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
 
-        masks = [columns > k for k in range(STRIP)]
+        masks = [lanes.columns > k for k in range(STRIP)]
         for k in range(2):
             at = row + k - RADIUS
-            center = places[1] + mi.UInt32(at) * COLUMN
-            ready = (at >= first) & (at < end)
+            center = lanes.places[1] + mi.UInt32(at) * COLUMN
+            ready = (at >= lanes.first) & (at < end)
 
             def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> list[Float]:
                 return list(read_packet(plane, center, ready))
@@ -361,22 +362,12 @@ def _walk(
                 )
             for t, v in zip(masks, numbers, strict=True):
                 total = total + dr.select(t & ready, v, 0)
-        return row + 2, end, first, places, columns, height, windows, total, targets
+        return row + 2, windows, total, targets
 
     windows = [packet([mi.Float(0) for _ in range(inputs * STRIP)]) for _ in range(2 * RADIUS)]
     end = on_aligned_stack(lanes.end)
-    state = (
-        lanes.first - RADIUS,
-        end,
-        lanes.first,
-        lanes.places,
-        lanes.columns,
-        height,
-        windows,
-        mi.Float(0),
-        targets,
-    )
+    state = (lanes.first - RADIUS, windows, mi.Float(0), targets)
     *_, total, targets = dr.while_loop(
-        state, lambda row, end, *_: row < end + RADIUS, body, label="window"
+        state, lambda row, *_: row < end + RADIUS, body, label="window"
     )
     return targets, total

@@ -39,14 +39,6 @@ class Lanes:
     columns: UInt32  #: Number of the strip's columns that lie in the image, 0 to 8.
 
 
-@dataclass(frozen=True)
-class Runs:
-    """Lanes over which a window walks, and how many numbers of the image they cover."""
-
-    lanes: Lanes
-    num_pixels: int
-
-
 class Planes:
     """The layout of an image [H, W, 3] in planes."""
 
@@ -162,18 +154,13 @@ class Planes:
 
     def _pixels_of(self, region: Region) -> tuple[UInt32, UInt32, UInt32]:
         """Return (component, x, y) of the numbers of a flat image on a region."""
-        width, height = region.block
-        lane = dr.arange(mi.UInt32, 3 * region.num_blocks * width * height)
+        lane = dr.arange(mi.UInt32, 3 * region.num_pixels)
         pixel = lane // 3
-        block = pixel // (width * height)
-        within = pixel - block * (width * height)
-        x = dr.gather(mi.UInt32, region.x, block) + within % width
-        y = dr.gather(mi.UInt32, region.y, block) + within // width
-        return lane - 3 * pixel, x, y
+        return lane - 3 * pixel, *region.pixels(pixel)
 
-    def runs(self, region: Region | None, reach: int) -> Runs:
+    def runs(self, region: Region | None, reach: int) -> tuple[Lanes, int]:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around
-        it.
+        it, and how many numbers of the image they cover.
         """
         cells = np.ones((self.height, self.num_strips), bool)  # the strips of each row
         if region is not None:
@@ -217,7 +204,7 @@ class Planes:
             from_numpy(mi.Int32, np.tile(end, 3)),
             from_numpy(mi.UInt32, np.tile(columns, 3)),
         )
-        return Runs(lanes, 3 * int(((end - first) * columns).sum()))
+        return lanes, 3 * int(((end - first) * columns).sum())
 
 
 def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit:

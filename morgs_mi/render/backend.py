@@ -99,5 +99,5 @@ def exp2(p: Float) -> Float:
         value = dr.fma(value, f, coefficient)
     exponent = dr.reinterpret_array(mi.Int32, total) << 23  # pyright: ignore[reportOperatorIssue]
     bits = dr.reinterpret_array(mi.Int32, value) + exponent
-    power = dr.reinterpret_array(mi.Float, bits)
+    power: Float = dr.reinterpret_array(mi.Float, bits)
     return dr.replace_grad(power, _LN2 * power * p) if dr.grad_enabled(p) else power

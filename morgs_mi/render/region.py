@@ -246,16 +246,16 @@ class Region:
         blocks[row, :, column] = values
         return blocks.reshape(rows * height, columns * width, *rest)
 
-    def paste(self, values: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """Return a copy of an image [H, W, ...] with this region's pixels replaced by `values`."""
-        row, column = self._blocks
-        rows, columns = self.drawn.shape
+    def pixels(self, lane: UInt32) -> tuple[UInt32, UInt32]:
+        """Return the coordinates (x, y) in the view of the pixels at some places of an image."""
+        if self.whole:
+            y = quotient(lane, self.row)
+            return lane - y * dr.opaque(mi.UInt32, self.row), y
         width, height = self.block
-        whole = np.zeros((rows * height, columns * width, *image.shape[2:]), image.dtype)
-        whole[: self.height, : self.width] = image
-        blocks = whole.reshape(rows, height, columns, width, *image.shape[2:])
-        blocks[row, :, column] = values
-        return whole[: self.height, : self.width]
+        block = lane // (width * height)
+        within = lane - block * (width * height)
+        x = dr.gather(mi.UInt32, self.x, block) + within % width
+        return x, dr.gather(mi.UInt32, self.y, block) + within // width
 
 
 def joined(regions: Sequence[Region]) -> Region:
@@ -302,16 +302,7 @@ def quotient(lane: UInt32, divisor: int) -> UInt32:
 
 def on_region(values: Float, region: Region) -> Float:
     """Return an image [H W] of one float per pixel on the region, 0 outside the view."""
-    lane = dr.arange(mi.UInt32, region.num_pixels)
-    if region.whole:
-        row = quotient(lane, region.row)
-        x = lane - row * dr.opaque(mi.UInt32, region.row)
-        y = row
-    else:
-        block = lane // (region.block[0] * region.block[1])
-        within = lane - block * (region.block[0] * region.block[1])
-        x = dr.gather(mi.UInt32, region.x, block) + within % region.block[0]
-        y = dr.gather(mi.UInt32, region.y, block) + within // region.block[0]
+    x, y = region.pixels(dr.arange(mi.UInt32, region.num_pixels))
     width = dr.opaque(mi.UInt32, region.width)
     height = dr.opaque(mi.UInt32, region.height)
     image = dr.gather(mi.Float, values, y * width + x, active=(x < width) & (y < height))

@@ -111,26 +111,14 @@ def _in_front(
     """
     camera = view.pixels.camera
     x, y, width, height = view.pixels.crop
-    mask = np.zeros((camera.height, camera.width), bool)
-    mask[y : y + height, x : x + width] = view.mask
+    limit = np.full((camera.height, camera.width), np.inf, np.float32)
+    limit[y : y + height, x : x + width] = np.array(view.depth).reshape(height, width)
+    mask = np.isfinite(limit)
     if not mask.any():
         return None
-    pixel = dr.arange(mi.UInt32, width * height)
-    row = pixel // dr.opaque(mi.UInt32, width)
-    limit = dr.full(mi.Float, dr.inf, mask.size)
-    place = dr.fma(
-        row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x
-    )
-    dr.scatter(limit, view.depth, place, mode=dr.ReduceMode.Permute)
     region = Region(mask)
-    depth_limit = mi.TensorXf(limit, mask.shape)
-    part = rasterize(
-        gaussians, camera, channels, region=region, config=config, depth_limit=depth_limit
-    )
-    index_image = region.paste(
-        np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]),
-        np.zeros(mask.shape, int),
-    )
+    part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=limit)
+    index_image = region.uncropped(np.arange(region.num_pixels).reshape(region.shape(1)[:3]))
     index = from_numpy(mi.UInt32, index_image[y : y + height, x : x + width])
     has_surface = view.coverage > 0
 

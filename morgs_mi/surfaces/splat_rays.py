@@ -76,7 +76,7 @@ class _Tree:
         ray: Any,
         active: Bool,
         state: tuple[Jit, ...],
-        visit: Callable[[tuple[Jit, ...], UInt32, Bool], tuple[Jit, ...]],
+        visit: Callable[[tuple[Jit, ...], UInt32], tuple[Jit, ...]],
         span: Callable[[tuple[Jit, ...]], tuple[Float, Float]],
     ) -> tuple[Jit, ...]:
         """Visit the leaves with boxes that meet a part of each ray, roughly front to back, and
@@ -86,7 +86,7 @@ class _Tree:
             ray: rays [M].
             active: rays that are traced.
             state: values [M].
-            visit: (state, leaf, active) -> state, called for the leaves.
+            visit: (state, leaf) -> state, called for the leaves.
             span: state -> (start, end) of the part of the ray that is searched.
         """
         inverse = dr.rcp(ray.d)
@@ -106,7 +106,7 @@ class _Tree:
             state = dr.if_stmt(
                 (state, actual - (mi.UInt32(1) << self.depth)),
                 leaf,
-                lambda state, index: visit(state, index, mi.Bool(True)),
+                visit,
                 lambda state, index: state,
                 label="leaf",
             )
@@ -209,7 +209,7 @@ class SplatRays:
             active: rays that are traced; the others get 1.
         """
 
-        def visit(state: tuple[Jit, ...], leaf: UInt32, active: Bool) -> tuple[Jit, ...]:
+        def visit(state: tuple[Jit, ...], leaf: UInt32) -> tuple[Jit, ...]:
             return (state[0] * (1 - self._response(ray, leaf)[1]),)
 
         def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
@@ -276,7 +276,7 @@ class SplatRays:
         were found.
         """
 
-        def visit(state: tuple[Jit, ...], row: UInt32, active: Bool) -> tuple[Jit, ...]:
+        def visit(state: tuple[Jit, ...], row: UInt32) -> tuple[Jit, ...]:
             depths, rows, count = state
             depths = list(depths)
             rows = list(rows)

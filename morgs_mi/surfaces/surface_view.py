@@ -299,11 +299,6 @@ class SurfaceView:
             )
         return bool(attached)
 
-    @property
-    def mask(self) -> np.ndarray:
-        """The pixels in which a surface is seen, bool [h, w]."""
-        return np.array(self.coverage > 0).reshape(self.image.shape[:2])
-
 
 def coverage_and_depth(
     scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int]
@@ -328,9 +323,8 @@ def coverage_and_depth(
     lane: UInt32 = dr.arange(mi.UInt32, across * down)
     columns: UInt32 = dr.opaque(mi.UInt32, across)
     row = lane // columns
-    pixel = (
-        (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
-    )
+    column = lane - row * columns
+    pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + column + int(first[0])
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
@@ -355,13 +349,12 @@ def coverage_and_depth(
     count, total = cast(pixel, _FIRST)
     rays = dr.full(mi.Float, len(_FIRST), across * down)
     dr.eval(count, total, rays)
-    column = lane - row * columns
     neighbours = (
         (lane - 1, column > 0),
         (lane + 1, column + 1 < columns),
         (lane - columns, row > 0),
+        (lane + columns, lane + columns < across * down),
     )
-    neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
     is_mixed: Bool = (count > 0) & (count < len(_FIRST))
     for place, valid in neighbours:
         is_mixed |= dr.gather(mi.Float, count, place, active=valid) != count

@@ -171,7 +171,8 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
         * region.crop(np.ones((region.height, region.width), bool))[..., None]
         * 0.1
     )
-    new_image = region.paste(changed, truth)
+    pixels = region.uncropped(changed)[:height, :width]
+    new_image = np.where(region.mask[..., None], pixels, truth)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
 
     def evaluate(image, where):

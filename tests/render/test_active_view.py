@@ -48,9 +48,7 @@ def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
 def drawn_pixels(view: ActiveView) -> np.ndarray:
     """Return 1 on the pixels of the view's blocks [H, W], 0 elsewhere."""
     assert view.region is not None
-    return view.region.paste(
-        np.ones(view.region.shape(1)[:3]), np.zeros((view.camera.height, view.camera.width))
-    )
+    return np.asarray(view.region.mask, float)
 
 
 def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaussians, mask):
