@@ -9,7 +9,7 @@ the recorded images is compared in withheld pixels, blocks of every view that no
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,7 +95,7 @@ def balance_cameras(
     steps = short_config.planned_steps
     count = 0
 
-    def fitted(start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
+    def fitted(start: Gaussians, exposures: Sequence[Exposure], steps: int) -> Gaussians:
         """Return Gaussians after some steps, from a start, in the colours of the scene."""
         nonlocal count
         views = _corrected(visible, exposures)
@@ -106,25 +106,23 @@ def balance_cameras(
         report(count, how.rounds + _COMPARED)
         return result.gaussians
 
-    as_recorded = {v: Exposure() for v in range(len(problem.views))}
+    as_recorded = (Exposure(),) * len(problem.views)
     exposures = as_recorded
     gaussians = problem.start
     for k in range(how.rounds):
         gaussians = fitted(gaussians, exposures, -(-steps // 2) if k else steps)
         # Relative to the Gaussians, without what most cameras have in common.
         exposures = centred(
-            {
-                v: fit_exposure(
-                    rendered(gaussians, camera, problem.render), unit_values(image), mask
-                )
-                for v, (camera, image, mask) in enumerate(visible)
-            }
+            [
+                fit_exposure(rendered(gaussians, camera, problem.render), unit_values(image), mask)
+                for camera, image, mask in visible
+            ]
         )
-        largest = max(exposure.change for exposure in exposures.values())
+        largest = max(exposure.change for exposure in exposures)
         if config.exposure == "auto" and largest < LEAST_DIFFERENCE:
-            return Balance(tuple(exposures.values()), False)
+            return Balance(exposures, False)
     if config.exposure == "on":
-        return Balance(tuple(exposures.values()), True)
+        return Balance(exposures, True)
     scores = []
     for view_exposures in (as_recorded, exposures):
         gaussians = fitted(problem.start, view_exposures, steps)
@@ -133,9 +131,10 @@ def balance_cameras(
         scores.append(mean_psnr(gaussians, some, problem.render))
     recorded_psnr, balanced_psnr = scores
     is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
-    return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
+    return Balance(exposures, is_gain, recorded_psnr, balanced_psnr)
 
 
-def _corrected(views: Sequence[View], exposures: Mapping[int, Exposure]) -> list[View]:
-    """Return views with images in the colours of the scene, by exposures by view index."""
-    return [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(views)]
+def _corrected(views: Sequence[View], exposures: Sequence[Exposure]) -> list[View]:
+    """Return views with images in the colours of the scene, by their exposures."""
+    pairs = zip(views, exposures, strict=True)
+    return [view._replace(image=exposure.corrected(view.image)) for view, exposure in pairs]

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -59,17 +58,10 @@ class DensityPlan:
     edits: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-class Room(NamedTuple):
-    """Largest number of births of a round, and of Gaussians after it."""
-
-    births: int
-    limit: int
-
-
 def plan_growth(
     gaussians: Gaussians,
     scores: np.ndarray,
-    room: Room,
+    births: int,
     extent: float,
     config: DensityConfig,
     rng: np.random.Generator,
@@ -83,7 +75,7 @@ def plan_growth(
     Args:
         gaussians: N Gaussians.
         scores: their densification scores [N].
-        room: for births.
+        births: largest number of births.
         extent: of the scene, world units.
         config: thresholds.
         rng: draws the means of the births.
@@ -92,7 +84,8 @@ def plan_growth(
     means = np.asarray(gaussians.means)
     opacities = np.asarray(gaussians.opacities)
     visible = (opacities >= config.min_opacity) & ~in_empty_space(cameras, means)
-    survivors, parents = _select(visible, scores, room, 0)
+    survivors = _survivors(visible)
+    parents = _parents(survivors, scores, births, 0)
     parent = np.concatenate([survivors, parents])
     is_parent = np.isin(parent, parents)
     scales = np.asarray(gaussians.scales)[parent]
@@ -136,30 +129,30 @@ def plan_additions(
         rng: draws the means of the births.
         num_static: number of the other Gaussians, which stay unchanged.
     """
-    births = round(config.births * (len(gaussians) + num_static))
-    room = Room(births, max(config.max_gaussians - num_static, 0))
-    visible = np.asarray(gaussians.opacities) >= config.min_opacity
-    survivors, parents = _select(visible, scores, room, config.min_error)
+    survivors = _survivors(np.asarray(gaussians.opacities) >= config.min_opacity)
+    # At the limit, none is pruned for it: a later frame draws a part of the pixels, in which it
+    # cannot see what a Gaussian contributes elsewhere.
+    room = max(config.max_gaussians - num_static - len(survivors), 0)
+    births = min(round(config.births * (len(gaussians) + num_static)), room)
+    parents = _parents(survivors, scores, births, config.min_error)
     is_birth = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(is_birth, _logit(_BIRTH_OPACITY) - logits, 0)
     return _plan(gaussians, survivors, parents, np.where(is_birth, _LOG_SHRINK, 0), fainter, rng)
 
 
-def _select(
-    visible: np.ndarray, scores: np.ndarray, room: Room, min_error: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the survivors, and the indices of the parents: survivors with the
-    largest error.
-
-    Gaussians that are not `visible` [N] are pruned. At the limit, others are not: a later frame
-    draws a part of the pixels, in which it cannot see what a Gaussian contributes elsewhere.
-    """
+def _survivors(visible: np.ndarray) -> np.ndarray:
+    """Return the indices of the `visible` [N], or of all if none is."""
     # Without any Gaussian, the scene could not recover.
-    survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
+    return np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
+
+
+def _parents(
+    survivors: np.ndarray, scores: np.ndarray, births: int, min_error: float
+) -> np.ndarray:
+    """Return the indices of those survivors that have the largest error."""
     candidates = survivors[scores[survivors] > min_error]
-    births = min(room.births, max(room.limit - len(survivors), 0))
-    return survivors, np.sort(candidates[np.argsort(-scores[candidates], kind="stable")][:births])
+    return np.sort(candidates[np.argsort(-scores[candidates], kind="stable")][:births])
 
 
 def _plan(

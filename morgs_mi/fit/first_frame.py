@@ -7,7 +7,7 @@ is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 
@@ -22,7 +22,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.density import DensityPlan, Room, plan_growth
+from morgs_mi.fit.density import plan_growth
 from morgs_mi.fit.dropout import dropped
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import (
@@ -117,8 +117,16 @@ def fit_first_frame(
                 views = [ActiveView(camera, problem.render) for camera in problem.cameras]
                 targets = [Target(view.image, view.mask) for view in problem.views]
             gaussians = start.with_parameters(values_of(optimizer))
-            rounds_left = len(rounds) - rounds.index(first)
-            plan = _plan_round(gaussians, views, targets, rounds_left, problem, config, rng)
+            missing = max(config.planned_gaussians - len(gaussians), 0)
+            plan = plan_growth(
+                gaussians,
+                densification_scores(gaussians, views, targets),
+                -(-missing // (len(rounds) - rounds.index(first))),
+                problem.extent,
+                config.density,
+                rng,
+                problem.cameras,
+            )
             del gaussians  # tensors that the next steps would keep in memory
             select_rows(optimizer, plan.parent, plan.source < 0, plan.edits)
             start = start.select(plan.parent)
@@ -137,30 +145,6 @@ def density_rounds(config: FitConfig) -> list[int]:
     """Return the steps of the first frame before which density control acts."""
     steps = np.linspace(_FIRST_ROUND, LAST_ROUND, config.density.rounds) * config.planned_steps
     return sorted(set(steps.astype(int).tolist()))
-
-
-def _plan_round(
-    gaussians: Gaussians,
-    views: Sequence[ActiveView],
-    targets: Sequence[Target],
-    rounds_left: int,
-    problem: FirstFrameProblem,
-    config: FitConfig,
-    rng: np.random.Generator,
-) -> DensityPlan:
-    """Return the plan of the next of the rounds of density control that are left."""
-    planned = config.planned_gaussians
-    births = -(-max(planned - len(gaussians), 0) // rounds_left)
-    scores = densification_scores(gaussians, views, targets)
-    return plan_growth(
-        gaussians,
-        scores,
-        Room(births, limit=planned),
-        problem.extent,
-        config.density,
-        rng,
-        problem.cameras,
-    )
 
 
 def _add_band(optimizer: Adam, base: Gaussians) -> None:

@@ -13,7 +13,7 @@ exposure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -153,7 +153,7 @@ def _line(
     return float(prior[0] + change[0]), float(prior[1] + change[1] + _TOE * change[0])
 
 
-def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
+def centred(exposures: Sequence[Exposure]) -> tuple[Exposure, ...]:
     """Return the exposures of all cameras relative to the one that most of them agree on.
 
     Which of them are right is unknown: all could be brighter and the scene darker. The reference
@@ -161,12 +161,11 @@ def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
     a mean away from all others, and the rendering of a view between those with it.
     """
     dark, bright = (
-        np.median([exposure(tone) for exposure in exposures.values()], axis=0)
-        for tone in _MIDDLE_TONES
+        np.median([exposure(tone) for exposure in exposures], axis=0) for tone in _MIDDLE_TONES
     )
     gain = (bright - dark) / (_MIDDLE_TONES[1] - _MIDDLE_TONES[0])
     reference = _exposure(gain, dark - gain * _MIDDLE_TONES[0])
-    return {view: exposure.without(reference) for view, exposure in exposures.items()}
+    return tuple(exposure.without(reference) for exposure in exposures)
 
 
 def common_change(exposures: Sequence[Exposure]) -> Exposure:

@@ -72,18 +72,19 @@ def _checked_flow(
 ) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
     backward, forward = source(pair)
-    valid = pair.valid
+    valid = np.ones(backward.shape[:2], bool) if pair.valid is None else pair.valid
+    within = valid
     if pair.box is not None:
-        valid = np.zeros(backward.shape[:2], bool)
-        valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
+        within = np.zeros_like(valid)
+        within[pair.box] = valid[pair.box]
     reliable, forward_reliable = (
-        consistency_mask(flow, back, config) & (True if valid is None else valid)
+        consistency_mask(flow, back, config) & within
         for flow, back in ((backward, forward), (forward, backward))
     )
     if pair.region is not None:
         # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
         backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
-        still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
+        still = ~pair.region & valid
         reliable = reliable | still
         forward_reliable = forward_reliable | still
     return FlowObservation(-backward, reliable, forward, forward_reliable)

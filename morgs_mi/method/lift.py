@@ -67,26 +67,26 @@ MAX_LOGIT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class _LiftView:
-    """Flow of one key view at every Gaussian."""
+class _Flows:
+    """Flow of V key views at N Gaussians."""
 
-    weight: np.ndarray  # W [N]
-    flow: np.ndarray  # u [N, 2], px
-    variance: np.ndarray  # of the flow over the pixels of the Gaussian [N], px^2
-    jacobian: np.ndarray  # J [N, 2, 3], px per world unit
-    floor: float  # of the motion, px
+    weight: np.ndarray  # W [V, N]
+    flow: np.ndarray  # u [V, N, 2], px
+    variance: np.ndarray  # of the flow over the pixels of the Gaussian [V, N], px^2
+    jacobian: np.ndarray  # J [V, N, 2, 3], px per world unit
+    floor: np.ndarray  # of the motion [V, 1], px
 
     def project(self, d: np.ndarray) -> np.ndarray:
-        """Return J d [N, 2] in px."""
-        return np.einsum("nij,nj->ni", self.jacobian, d)
+        """Return J d [V, N, 2] in px."""
+        return np.einsum("vnij,nj->vni", self.jacobian, d)
 
     def cost(self, d: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Return r(u - J d) [N] (see the module), with the scale s that belongs to a motion [N, 2]
-        in px.
+        """Return r(u - J d) [V, N] (see the module), with the scale s that belongs to a motion
+        [V, N, 2] in px.
         """
-        scale = _NOISE_PX + _NOISE_FRACTION * np.linalg.norm(motion, axis=1)
+        scale = _NOISE_PX + _NOISE_FRACTION * np.linalg.norm(motion, axis=-1)
         return np.log1p(
-            (np.sum((self.flow - self.project(d)) ** 2, axis=1) + self.variance) / scale**2
+            (np.sum((self.flow - self.project(d)) ** 2, axis=-1) + self.variance) / scale**2
         )
 
 
@@ -120,52 +120,46 @@ def lift_flow(
     maps[..., 2] = np.sum(flow**2, axis=-1)
     maps[..., 3] = 1
     maps *= reliable[..., None]
-    view_sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
+    sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
+    average = sums[..., :3] / np.maximum(sums[..., 3:], 1e-6)
     means = gaussians.numpy()["means"].astype(np.float64)
-    view_motions = []
-    for sums, view in zip(view_sums, group.views, strict=True):
-        average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
-        variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
-        jacobian = view.camera.projection_jacobian(means)
-        floor = motion_floor(view.camera.width, masks)
-        view_motions.append(_LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor))
-    d = _solve(view_motions, [np.ones(len(means))] * len(view_motions))
+    cameras = [view.camera for view in group.views]
+    flows = _Flows(
+        sums[..., 3],
+        average[..., :2],
+        np.maximum(average[..., 2] - np.sum(average[..., :2] ** 2, axis=-1), 0),
+        np.stack([camera.projection_jacobian(means) for camera in cameras]),
+        np.array([[motion_floor(camera.width, masks)] for camera in cameras]),
+    )
+    d = _solve(flows, np.ones_like(flows.weight))
     for _ in range(_ROUNDS):  # iteratively reweighted least squares
-        trust = [np.exp(-view.cost(d, view.project(d))) for view in view_motions]
-        d = _solve(view_motions, trust)
-    logit = _logits(view_motions, d)
+        d = _solve(flows, np.exp(-flows.cost(d, flows.project(d))))
+    logit = _logits(flows, d)
     return MotionStart(
         np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
     )
 
 
-def _logits(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
+def _logits(flows: _Flows, d: np.ndarray) -> np.ndarray:
     """Return the logits [N] of the confidence that Gaussians move by d [N, 3]: from the evidence e,
     by which d explains the flow better than no motion does.
     """
-    gain = np.zeros(len(d))
-    total = np.full(len(d), 1e-6)
-    is_visible = np.zeros(len(d), bool)
-    for view in views:
-        motion = view.project(d)
-        a = view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
-        gain += a * (view.cost(np.zeros_like(d), motion) - view.cost(d, motion))
-        total += a
-        is_visible |= np.linalg.norm(motion, axis=1) > view.floor
+    motion = flows.project(d)
+    a = flows.weight / (flows.weight + _HALF_WEIGHT_PIXELS)
+    gain = (a * (flows.cost(np.zeros_like(d), motion) - flows.cost(d, motion))).sum(axis=0)
+    total = a.sum(axis=0, initial=1e-6)
     logit = _CONFIDENCE_SLOPE * (gain / total - _MIN_EVIDENCE)
+    is_visible = np.any(np.linalg.norm(motion, axis=-1) > flows.floor, axis=0)
     return np.where(is_visible, np.clip(logit, -MAX_LOGIT, MAX_LOGIT), -MAX_LOGIT)
 
 
-def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:
-    """Return d [N, 3] of the system with the weights k = `trust`."""
-    system: np.ndarray | float = 0.0
-    right: np.ndarray | float = 0.0
-    for view, k in zip(views, trust, strict=True):
-        J = view.jacobian
-        weight = k * view.weight
-        system = system + weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
-        right = right + np.einsum("nij,ni->nj", J, weight[:, None] * view.flow)
+def _solve(flows: _Flows, trust: np.ndarray) -> np.ndarray:
+    """Return d [N, 3] of the system with the weights k = `trust` [V, N]."""
+    J = flows.jacobian
+    weight = trust * flows.weight
+    system = (weight[..., None, None] * np.einsum("vnij,vnik->vnjk", J, J)).sum(axis=0)
+    right = np.einsum("vnij,vni->vnj", J, weight[..., None] * flows.flow).sum(axis=0)
     # lambda, which has the unit of J' J.
-    scales = [np.median(np.sum(view.jacobian[:, 0] ** 2, axis=1)) for view in views]
+    scales = np.median(np.sum(J[:, :, 0] ** 2, axis=-1), axis=-1)
     prior = max(_PRIOR_PIXELS * float(np.mean(scales)), 1e-30)
-    return np.linalg.solve(system + prior * np.eye(3), np.asarray(right)[..., None])[..., 0]
+    return np.linalg.solve(system + prior * np.eye(3), right[..., None])[..., 0]

@@ -17,7 +17,6 @@ from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import MAX_LOGIT, lift_flow
-from morgs_mi.method.method_registry import Registry
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.photometric import refine_start
@@ -25,22 +24,12 @@ from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.method.search import search_motion
 from morgs_mi.method.ssim import Target
 
-# (problem, start) -> start.
-Start = Callable[[MotionProblem, MotionStart], MotionStart]
-
-STARTS: Registry[Start, MotionConfig] = Registry("MotionConfig()", "start", MotionConfig)
-
-
-STARTS.register("lift_flow")(
-    lambda _, config: lambda p, start: lift_flow(p.gaussians, p.views, p.flows, config.masks)
-)
-STARTS.register("propagate_motion")(lambda _, config: propagate_motion)
-STARTS.register("search_motion")(
-    lambda _, config: lambda p, start: search_motion(p, start, config.search)
-)
-STARTS.register("refine_start")(
-    lambda _, config: refine_start if config.two_gates else lambda p, start: start
-)
+STARTS: dict[str, Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]] = {
+    "lift_flow": lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows, config.masks),
+    "propagate_motion": lambda p, start, config: propagate_motion(p, start),
+    "search_motion": lambda p, start, config: search_motion(p, start, config.search),
+    "refine_start": lambda p, start, config: refine_start(p, start) if config.two_gates else start,
+}
 
 # Logit that a confidence loses per frame without evidence of motion: where something moved, more is
 # to correct.
@@ -77,9 +66,9 @@ def initial_motion(
         return replace(start, displacement=np.asarray(gaussians.motion))
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
     problem = MotionProblem(gaussians, views, targets, rng, flows)
-    for name in STARTS.names:
+    for name, stage in STARTS.items():
         if getattr(config, name):
-            start = STARTS.make(name, config)(problem, start)
+            start = stage(problem, start, config)
     logit = start.logit_confidence
     if gaussians.logit_confidence is not None:
         last_logit = np.asarray(gaussians.logit_confidence)

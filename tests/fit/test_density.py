@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.density import (
-    Room,
     apply_plan,
     plan_additions,
     plan_growth,
@@ -42,7 +41,7 @@ def growth(gaussians, error, cameras=()):
     return plan_growth(
         gaussians,
         np.asarray(error, float),
-        Room(n, 2 * n),
+        n,
         10.0,
         CONFIG,
         np.random.default_rng(1),

@@ -45,7 +45,7 @@ def start(config: MotionConfig):
 
 def test_initial_motion__runs_the_stages_that_are_on():
     off = replace(MotionConfig(), propagate_motion=False, search_motion=False, refine_start=False)
-    assert all(hasattr(off, name) for name in STARTS.names)
+    assert all(hasattr(off, name) for name in STARTS)
     lifted = start(off)
     motion = start(MotionConfig())
     assert lifted is not None
