@@ -47,11 +47,6 @@ def stable_order(keys: UInt32, buckets: int) -> UInt32:
     return dr.argsort(keys)
 
 
-def add_mode() -> dr.ReduceMode:
-    """Return the mode of scatter-additions to the records of a lane's section, see `sections`."""
-    return dr.ReduceMode.NoConflicts if on_cpu() else dr.ReduceMode.Auto
-
-
 def sections(lanes: int) -> tuple[int, int, int]:
     """Return (launches, sections, lanes) that divide the lanes of a kernel: each launch has equally
     many sections, each section equally many lanes, the last ones without work.

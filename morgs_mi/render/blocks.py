@@ -23,7 +23,7 @@ from morgs_mi.core.types import Bool, Float, UInt32
 from morgs_mi.render.backend import stable_order
 from morgs_mi.render.cut import FARTHEST_CUT
 from morgs_mi.render.projection import Splats
-from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, quotient
+from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, on_region, quotient
 from morgs_mi.render.render_config import RenderConfig
 
 # A thousandth of an octave: the block test may accept too many entries, never too few.
@@ -42,10 +42,16 @@ class BlockLists:
     begin: UInt32  #: Place of each block's first word [A]; the next ones follow at steps of 32.
     end: UInt32  #: Place past its last word [A].
     first: UInt32  #: First entry of its tile [A].
-    count: UInt32  #: Number of set bits of each block [A].
     order: UInt32  #: Blocks by falling count, roughly [A]: the lanes of a packet finish together.
     depth_order_of: UInt32  #: Of each splat [N].
     by_depth_order: UInt32  #: Splats by depth order [N].
+    # Of each block [A], see `Region`.
+    x: UInt32
+    y: UInt32
+    place: UInt32
+    rows: UInt32
+    pitch: UInt32  #: As in `Region`, [1].
+    limits: Float | None  #: Image on the region, the depth limit of every pixel; None: none.
 
 
 def build_lists(
@@ -70,7 +76,9 @@ def build_lists(
     by_depth_order = dr.argsort(depths)
     depth_order_of = dr.empty(mi.UInt32, N)
     dr.scatter(depth_order_of, dr.arange(mi.UInt32, N), by_depth_order, mode=dr.ReduceMode.Permute)
-    rectangles = _tile_rectangles(splats, region)
+    # Each splat's first tile, its tiles across, and the number of its tiles in the region.
+    (x0, y0, x1, _), counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
+    rectangles = [x0, y0, x1 - x0, dr.select(splats.valid, counts, 0)]
     dr.eval(rectangles)
     tiles = _tile_lists([dr.gather(mi.UInt32, v, by_depth_order) for v in rectangles], region)
 
@@ -96,10 +104,11 @@ def build_lists(
         begin,
         end,
         first,
-        count,
         order,
         depth_order_of,
         by_depth_order,
+        *(region.x, region.y, region.place, region.rows, region.pitch),
+        None if limits is None else on_region(limits, region),
     )
 
 
@@ -208,14 +217,6 @@ def _cells_within(
         return dr.gather(mi.UInt32, table, y * (across + 1) + x)
 
     return (x0, y0, x1, y1), before(x1, y1) - before(x0, y1) - before(x1, y0) + before(x0, y0)
-
-
-def _tile_rectangles(splats: Splats, region: Region) -> tuple[UInt32, UInt32, UInt32, UInt32]:
-    """Return each splat's first tile (x, y), its tiles across, and the number of its tiles in the
-    region.
-    """
-    (x0, y0, x1, _), counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
-    return x0, y0, x1 - x0, dr.select(splats.valid, counts, 0)
 
 
 def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
@@ -352,35 +353,41 @@ def _block_bits(
                 touches &= ahead[i]
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
-    if farthest_limits is not None:
-        # A depth limit may cut the entries that would hide later ones: no entry is omitted for its
-        # transmittance.
-        dr.eval(mask)
-        return _transposed_words(mask, tiles, first_word, end_word, num_words)
-
-    # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper bound
-    # of the transmittance behind an entry. Entries below the stop in all blocks are not listed;
-    # they would not have been blended.
-    def distance(x: Float, y: Float) -> Float:
-        u = dr.fma(a, x, b * y)
-        v = c * y
-        return dr.fma(u, u, v * v)
-
-    farthest = distance(left, top)
-    for x, y in ((left, bottom), (right, top), (right, bottom)):
-        farthest = dr.maximum(farthest, distance(x, y))
-    alpha = dr.select(farthest < reach - 2 * _TEST_SLACK, dr.exp2(log2_opacity - farthest), 0)
-    log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
-    dr.eval(mask, log2_transmitted)
-    behind = dr.prefix_sum(mi.Float64(log2_transmitted))
-    log2_transmittance = behind - dr.gather(
-        mi.Float64, behind, dr.gather(mi.UInt32, tiles.first, slot)
+    # A depth limit may cut the entries that would hide later ones: no entry is omitted for its
+    # transmittance.
+    if farthest_limits is None:
+        # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper
+        # bound of the transmittance behind an entry. Entries below the stop in all blocks are not
+        # listed; they would not have been blended.
+        farthest = mi.Float(0)
+        for x in (left, right):
+            for y in (top, bottom):
+                u = dr.fma(a, x, b * y)
+                v = c * y
+                farthest = dr.maximum(farthest, dr.fma(u, u, v * v))
+        alpha = dr.select(farthest < reach - 2 * _TEST_SLACK, dr.exp2(log2_opacity - farthest), 0)
+        log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
+        dr.eval(mask, log2_transmitted)
+        behind = dr.prefix_sum(mi.Float64(log2_transmitted))
+        first = dr.gather(mi.UInt32, tiles.first, slot)
+        log2_transmittance = behind - dr.gather(mi.Float64, behind, first)
+        # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
+        least = log2(max(config.stop_transmittance, 1e-38)) - 0.5
+        mask = dr.select(log2_transmittance < least, 0, mask)
+    dr.eval(mask)
+    place = dr.gather(mi.UInt32, first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
+    masks = dr.zeros(mi.UInt32, num_words * 32)
+    dr.scatter(
+        masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts
     )
-    # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
-    mask = dr.select(
-        log2_transmittance < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask
-    )
-    return _transposed_words(mask, tiles, first_word, end_word, num_words)
+    dr.eval(masks)
+    word = dr.arange(mi.UInt32, num_words) * 32
+    rows = _transposed([dr.gather(mi.UInt32, masks, word + k) for k in range(32)])
+    words = dr.empty(mi.UInt32, num_words * 32)
+    for k, row in enumerate(rows):
+        dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(words)
+    return words, first_word, end_word
 
 
 def _farthest_limits(limits: Float, region: Region) -> Float:
@@ -400,28 +407,6 @@ def _farthest_limits(limits: Float, region: Region) -> Float:
     )
     dr.eval(farthest)
     return farthest
-
-
-def _transposed_words(
-    mask: UInt32, tiles: _Tiles, first_word: UInt32, end_word: UInt32, num_words: int
-) -> tuple[UInt32, UInt32, UInt32]:
-    """Return (words, first word of each tile, end word of each tile) of the blocks' bits of every
-    entry.
-    """
-    slot = tiles.slots
-    place = dr.gather(mi.UInt32, first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
-    masks = dr.zeros(mi.UInt32, num_words * 32)
-    dr.scatter(
-        masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts
-    )
-    dr.eval(masks)
-    word = dr.arange(mi.UInt32, num_words) * 32
-    rows = _transposed([dr.gather(mi.UInt32, masks, word + k) for k in range(32)])
-    words = dr.empty(mi.UInt32, num_words * 32)
-    for k, row in enumerate(rows):
-        dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(words)
-    return words, first_word, end_word
 
 
 def _clipped(value: Float | int, low: Float, high: Float) -> Float:

@@ -13,14 +13,13 @@ from morgs_mi.render.backend import sections
 from morgs_mi.render.blocks import BlockLists, pack_records
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.loops import (
-    Blocks,
     Layout,
     adjoint,
     primal,
     record_packets,
     tangent,
 )
-from morgs_mi.render.region import NO_SLOT, Region, on_region, quotient
+from morgs_mi.render.region import NO_SLOT, Region, quotient
 
 
 def blend(
@@ -29,7 +28,6 @@ def blend(
     region: Region,
     lists: BlockLists,
     layout: Layout,
-    limits: Float | None = None,
 ) -> list[Float]:
     """Blend every channel's columns over a region.
 
@@ -39,7 +37,6 @@ def blend(
         region: the blocks that are drawn.
         lists: the splats that touch them, built from the same geometry and columns.
         layout: sizes of the channels, whether their gradients reach the weights, and cut-offs.
-        limits: depth limit of every pixel [H W] if the layout has them.
 
     Returns:
         The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one
@@ -47,7 +44,7 @@ def blend(
         used further. Differentiable in `geometry` and `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
-    return dr.custom(_Blend, [*geometry, *columns], region, lists, layout, limits)
+    return dr.custom(_Blend, [*geometry, *columns], region, lists, layout)
 
 
 class _Blend(dr.CustomOp):
@@ -57,17 +54,13 @@ class _Blend(dr.CustomOp):
         region: Region,
         lists: BlockLists,
         layout: Layout,
-        limits: Float | None,
     ) -> list[Float]:
         # The lists' records contain the values already: they are arguments only to be
         # differentiated.
         self.region = region
         self.lists = lists
         self.layout = layout
-        self.blocks = Blocks.of(
-            region, lists, None if limits is None else on_region(limits, region)
-        )
-        self.images = recorded(primal, layout)(self.blocks, lists.records, self._allocated())
+        self.images = recorded(primal, layout)(lists, self._allocated())
         return self._outputs(self.images)
 
     def backward(self) -> None:
@@ -78,16 +71,14 @@ class _Blend(dr.CustomOp):
             *grads, alpha, coverage = grads
             grads = [*grads, alpha + coverage]
         grads = [padded(v, self.region, size) for v, size in zip(grads, layout.sizes, strict=True)]
-        columns = _gradients(self.blocks, self.lists, layout, self.images, grads)
+        columns = record_gradients(self.lists, layout, self.images, grads)
         missing = layout.geometry + layout.columns - len(columns)
         self.set_grad_in("values", [mi.Float(0)] * missing + columns)
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         tangents = pack_records(grads, self.lists.by_depth_order)
-        images = recorded(tangent, self.layout)(
-            self.blocks, self.lists.records, tangents, self._allocated()
-        )
+        images = recorded(tangent, self.layout)(self.lists, tangents, self._allocated())
         self.set_grad_out(self._outputs(images))
 
     def _allocated(self) -> list[Float]:
@@ -105,31 +96,19 @@ class _Blend(dr.CustomOp):
         return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
 
 
-def weighted_sums(
-    images: list[Float], region: Region, lists: BlockLists, layout: Layout
+def record_gradients(
+    lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
 ) -> list[Float]:
-    """Return the sums of images' pixels, weighted by each splat's blend weights.
+    """Return the gradients of the geometry (if the layout reaches it) and the columns, floats [N].
 
-    They are the gradients of the columns if the images are the gradients of the blended image. A
-    layout with detached channels does not need the blended image itself.
+    The gradients of columns that do not reach the weights are the sums of `grads`, weighted by each
+    splat's blend weights; they do not depend on `images`.
 
     Args:
+        lists: the splats that touch the blocks.
+        layout: description of the blend.
         images: flat image of each channel on the region.
-        region: the pixels that are summed over.
-        lists: the splats that touch them.
-        layout: channels that do not reach the weights.
-
-    Returns:
-        Floats [N] of each column of the channels.
-    """
-    return _gradients(Blocks.of(region, lists), lists, layout, images, images)
-
-
-def _gradients(
-    blocks: Blocks, lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
-) -> list[Float]:
-    """Return the gradients of the geometry (if the layout reaches it) and the columns, from the
-    images' gradients.
+        grads: their gradients.
     """
     N = dr.width(lists.by_depth_order)
     stride = 4 * record_packets(layout)
@@ -146,10 +125,8 @@ def _gradients(
         order = dr.gather(mi.UInt32, lists.order, place, is_block)
         order = dr.select(is_block, order, NO_SLOT)
         dr.eval(order)
-        section_blocks = replace(blocks, order=order)
-        sums = recorded(adjoint, layout)(
-            section_blocks, lists.records, images, grads, first_record, sums
-        )
+        section = replace(lists, order=order)
+        sums = recorded(adjoint, layout)(section, images, grads, first_record, sums)
     place = dr.arange(mi.UInt32, N * stride)
     parts = [
         dr.gather(mi.Float, sums, place + dr.opaque(mi.UInt32, k * N * stride))

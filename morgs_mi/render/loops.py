@@ -31,10 +31,10 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Bool, Float, UInt32
-from morgs_mi.render.backend import add_mode, block_shape, exp2, on_aligned_stack
+from morgs_mi.render.backend import block_shape, exp2, on_aligned_stack, on_cpu
 from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.cut import PROFILE, Cut
-from morgs_mi.render.region import NO_SLOT, Region
+from morgs_mi.render.region import NO_SLOT
 from morgs_mi.render.render_config import RenderConfig
 
 _LN2 = log(2.0)
@@ -95,72 +95,35 @@ def record_packets(layout: Layout) -> int:
 # --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """The arrays of a region and its lists that the loops read, see `Region` and `BlockLists`; one
-    entry per block.
-
-    `limits` is an image on the region, the depth limit of every pixel, or None.
-    """
-
-    x: UInt32
-    y: UInt32
-    place: UInt32
-    rows: UInt32
-    pitch: UInt32
-    words: UInt32
-    entries: UInt32
-    begin: UInt32
-    end: UInt32
-    first: UInt32
-    order: UInt32
-    limits: Float | None = None
-
-    @staticmethod
-    def of(region: Region, lists: BlockLists, limits: Float | None = None) -> Blocks:
-        """Return the arrays of a region, its lists and its depth limits."""
-        geometry = (region.x, region.y, region.place, region.rows, region.pitch)
-        return Blocks(
-            *geometry,
-            lists.words,
-            lists.entries,
-            lists.begin,
-            lists.end,
-            lists.first,
-            lists.order,
-            limits,
-        )
-
-
 class _Block:
     """The lanes' blocks: their pixels, their section of the lists, and the shape in which they are
     unrolled.
     """
 
-    def __init__(self, layout: Layout, blocks: Blocks) -> None:
-        is_block = blocks.order != NO_SLOT
+    def __init__(self, layout: Layout, lists: BlockLists) -> None:
+        is_block = lists.order != NO_SLOT
 
         def of_lane(values: UInt32) -> UInt32:
-            return dr.gather(mi.UInt32, values, blocks.order, is_block)
+            return dr.gather(mi.UInt32, values, lists.order, is_block)
 
         self.layout = layout
-        self.blocks = blocks
+        self.lists = lists
         self.width, self.height = block_shape(layout.config)
         self.area = self.width * self.height
-        self.place = of_lane(blocks.place)
-        self.rows = of_lane(blocks.rows)
-        self.pitch = dr.gather(mi.UInt32, blocks.pitch, mi.UInt32(0))
+        self.place = of_lane(lists.place)
+        self.rows = of_lane(lists.rows)
+        self.pitch = dr.gather(mi.UInt32, lists.pitch, mi.UInt32(0))
         # Centre of the first pixel.
-        self.x, self.y = (mi.Float(of_lane(v)) + 0.5 for v in (blocks.x, blocks.y))
-        begin = of_lane(blocks.begin)
-        first = of_lane(blocks.first)
+        self.x, self.y = (mi.Float(of_lane(v)) + 0.5 for v in (lists.x, lists.y))
+        begin = of_lane(lists.begin)
+        first = of_lane(lists.first)
         # One depth limit per pixel, row by row; none without depth limits.
         self.limits = (
-            [] if blocks.limits is None else [v for (v,) in _load_image(self, 1, blocks.limits)]
+            [] if lists.limits is None else [v for (v,) in _load_image(self, 1, lists.limits)]
         )
-        self.end = on_aligned_stack(of_lane(blocks.end))
+        self.end = on_aligned_stack(of_lane(lists.end))
         # One word before the block's first, as `next_entry` expects.
-        self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
+        self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, lists.words)
 
     def advance(
         self, walk: tuple[UInt32, UInt32, UInt32]
@@ -169,8 +132,8 @@ class _Block:
         entry.
         """
         place, word, base = walk
-        depth_order = dr.gather(mi.UInt32, self.blocks.entries, base + dr.tzcnt(word))
-        next_walk = next_entry(place, word & (word - 1), base, self.end, self.blocks.words)
+        depth_order = dr.gather(mi.UInt32, self.lists.entries, base + dr.tzcnt(word))
+        next_walk = next_entry(place, word & (word - 1), base, self.end, self.lists.words)
         return depth_order, next_walk
 
     def continues(self, walk: tuple[UInt32, UInt32, UInt32], T: list[Float]) -> Bool:
@@ -279,15 +242,15 @@ def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:
 # --------------------------------------------------------------------------------------------------
 
 
-def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) -> list[Float]:
+def primal(layout: Layout, lists: BlockLists, images: list[Float]) -> list[Float]:
     """Blend the records' columns into the channels' images, which are overwritten."""
-    block = _Block(layout, blocks)
+    block = _Block(layout, lists)
     G = layout.geometry
     C = layout.columns
 
     def body(walk, T, sums):
         depth_order, walk = block.advance(walk)
-        record = fetch_record(records, depth_order, G + C)
+        record = fetch_record(lists.records, depth_order, G + C)
         weights = block.weights(record[:G], T)
         sums = [
             [dr.fma(w, c, total) for c, total in zip(record[G:], row, strict=True)]
@@ -311,8 +274,7 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
 
 def adjoint(
     layout: Layout,
-    blocks: Blocks,
-    records: Float,
+    lists: BlockLists,
     images: list[Float],
     image_grads: list[Float],
     first_record: UInt32,
@@ -323,16 +285,15 @@ def adjoint(
 
     Args:
         layout: description of the blend.
-        blocks: the blocks and their lists.
-        records: records of N Gaussians.
+        lists: the blocks and their lists.
         images: images that `primal` returned.
         image_grads: their gradients.
         first_record: the record of depth order 0 that each lane adds to, see `backend.sections`.
         sums: the records.
     """
-    block = _Block(layout, blocks)
+    block = _Block(layout, lists)
     packets = record_packets(layout)
-    mode = add_mode()
+    mode = dr.ReduceMode.NoConflicts if on_cpu() else dr.ReduceMode.Auto  # see `sections`
     geometric = layout.reaches_weights
     G = layout.geometry
     C = layout.columns
@@ -344,7 +305,7 @@ def adjoint(
 
     def body(walk, T, S, sums):
         depth_order, walk = block.advance(walk)
-        record = fetch_record(records, depth_order, G + C)
+        record = fetch_record(lists.records, depth_order, G + C)
         geometry = record[:G]
         values = record[G:]
         dx, dy = block.offsets(geometry)
@@ -451,19 +412,17 @@ class _Moments:
 # --------------------------------------------------------------------------------------------------
 
 
-def tangent(
-    layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]
-) -> list[Float]:
+def tangent(layout: Layout, lists: BlockLists, tangents: Float, images: list[Float]) -> list[Float]:
     """Write the directional derivative along the records' tangents to `images`, which are
     overwritten.
     """
-    block = _Block(layout, blocks)
+    block = _Block(layout, lists)
     G = layout.geometry
     C = layout.columns
 
     def body(walk, T, dT, dsums):
         depth_order, walk = block.advance(walk)
-        record, tangent = (fetch_record(r, depth_order, G + C) for r in (records, tangents))
+        record, tangent = (fetch_record(r, depth_order, G + C) for r in (lists.records, tangents))
         with dr.resume_grad():
             inputs = [mi.Float(v) for v in (*record, *T)]
             dr.enable_grad(inputs)

@@ -215,7 +215,7 @@ def rasterize(
         config,
         cut,
     )
-    outputs = blend(splats.geometry, values, region, lists, layout, limits)
+    outputs = blend(splats.geometry, values, region, lists, layout)
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:

@@ -21,7 +21,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
-from morgs_mi.render.compositing import Layout, blend, weighted_sums
+from morgs_mi.render.compositing import Layout, blend, record_gradients
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import Splats, Views, project
@@ -172,9 +172,7 @@ class Drawing:
             columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
             records = pack_records([*splats.geometry, *columns], lists.by_depth_order)
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
-            grads = weighted_sums(
-                [image], self.group.region, replace(lists, records=records), layout
-            )
+            grads = record_gradients(replace(lists, records=records), layout, [image], [image])
             place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after
             lane_sums = [dr.gather(mi.Float, grad, place) for grad in grads]
             dr.eval(lane_sums)
