@@ -21,7 +21,7 @@ from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.losses import recon_loss
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
-from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.objective import (
     Observations,
     Prediction,
@@ -163,7 +163,8 @@ class _LaterFrameFit:
         if factory is not None:
             epochs = max(1, round(motion.model_share * config.epochs))
             start, self.losses = _fit_motion(
-                MotionProblem(self._previous, active.views, problem.targets, rng),
+                self._previous,
+                problem,
                 factory(self._previous, problem.extent, rng),
                 start,
                 self._next_steps(epochs * count),
@@ -255,7 +256,8 @@ class _LaterFrameFit:
 
 
 def _fit_motion(
-    problem: MotionProblem,
+    gaussians: Gaussians,
+    problem: FrameProblem,
     model: MotionModel,
     start: MotionStart | None,
     steps: Steps,
@@ -264,7 +266,8 @@ def _fit_motion(
     """Fit a motion model to the images by L_recon and the model's own losses.
 
     Args:
-        problem: N Gaussians, the active views and their images.
+        gaussians: N active Gaussians of the previous frame.
+        problem: the active views and their images.
         model: of their motion.
         start: displacement from which it starts, and colour from which the residual starts; None:
             none.
@@ -275,12 +278,11 @@ def _fit_motion(
         The start of the residual, with the confidence of `start` or of the previous frame, and the
         losses by name, means over the last round of views.
     """
-    gaussians = problem.gaussians
-    start = start or MotionStart.without_motion(problem.gaussians)
+    start = start or MotionStart.without_motion(gaussians)
     start_gaussians = displaced(gaussians, start.displacement)
 
     def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
-        view = problem.views[index]
+        view = problem.active.views[index]
         image = view.render(moved(start_gaussians, *model.motion(parameters)), ("color",))
         return {
             "recon": recon_loss(image.color, problem.targets[index], dssim_weight, view.region),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -166,13 +167,12 @@ class Planes:
         if region is not None:
             mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
             cells = np.any(mask.reshape(self.height, self.num_strips, STRIP), axis=2)
-        cells = np.pad(cells, ((reach, reach), (1, 1)))
+        cells = np.pad(cells, ((0, 0), (1, 1)))
         if reach:  # those within `reach` rows, or in the next strip, too
-            cells[:, 1:-1] |= cells[:, 2:] | cells[:, :-2]
+            window = np.ones((2 * reach + 1, 3), np.uint8)
+            cells = cv2.dilate(cells.astype(np.uint8), window) > 0
             cells[:, 0] = cells[:, 1]
             cells[:, -1] = cells[:, -2]
-            count = np.pad(cells, ((1, 0), (0, 0))).cumsum(0)
-            cells = count[2 * reach + 1 :] > count[: -2 * reach - 1]
         # The runs of cells in each column, in parts that are not too long.
         edges = np.diff(np.pad(cells.T, ((0, 0), (1, 1))).astype(np.int8), axis=1)
         strip, first = np.nonzero(edges == 1)
@@ -185,9 +185,7 @@ class Planes:
         strip = strip[index]
         # The lanes of a packet are neighbours in one column.
         order = np.lexsort((strip, first, (strip + _SPARE - 1) // COLUMN))
-        strip = strip[order]
-        first = first[order]
-        end = end[order]
+        strip, first, end = np.stack([strip, first, end])[:, order]
         columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP  # strip 1 is the first of the image

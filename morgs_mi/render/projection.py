@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import log2, sqrt
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -272,8 +273,8 @@ def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]],
     `viewmat`.
     """
     if isinstance(camera, Views):
-        memory = from_numpy(mi.Float64, np.stack([np.asarray(c.viewmat) for c in camera.cameras]))
-        numbers = [dr.gather(mi.Float64, memory, camera.view * 16 + k) for k in range(12)]
+        rows = [np.ravel(c.viewmat)[:12] for c in camera.cameras]
+        numbers = _row_of(mi.Float64, rows, camera.view)
     else:
         viewmat: Tensor = camera.viewmat
         if dr.is_tensor_v(viewmat):
@@ -293,10 +294,7 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
     They are read from memory: with Python numbers, every camera would compile its own kernels.
     """
     if isinstance(camera, Views):
-        values = [_numbers_of(c) for c in camera.cameras]
-        memory = from_numpy(mi.Float, values)
-        first = camera.view * len(values[0])
-        return [dr.gather(mi.Float, memory, first + i) for i in range(len(values[0]))]
+        return _row_of(mi.Float, [_numbers_of(c) for c in camera.cameras], camera.view)
     values = list(_numbers(mi.Float, tuple(_numbers_of(camera))))
     attached = camera.intrinsics if isinstance(camera, AttachedCamera) else ()
     return [*map(dr.replace_grad, values, attached), *values[len(attached) :]]
@@ -305,10 +303,16 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
 @lru_cache(maxsize=1024)  # the views of a rig are projected to again and again
 def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
     """Return numbers in memory, each an array of width 1."""
-    memory = from_numpy(kind, values)
-    elements = tuple(dr.gather(kind, memory, mi.UInt32(i)) for i in range(len(values)))
+    elements = tuple(_row_of(kind, [values], mi.UInt32(0)))
     dr.eval(elements)
     return elements
+
+
+def _row_of(kind: type[Jit], rows: Sequence[Any], index: UInt32) -> list[Jit]:
+    """Return the numbers of one of some rows in each lane."""
+    memory = from_numpy(kind, rows)
+    count = len(rows[0])
+    return [dr.gather(kind, memory, index * count + k) for k in range(count)]
 
 
 def _numbers_of(camera: Camera) -> list[float]:

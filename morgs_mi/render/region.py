@@ -91,7 +91,7 @@ class Region:
                 f"{description}; skip a view in which nothing is drawn."
             )
         grid = BlockGrid(mask.shape[1], mask.shape[0], block_shape(config or RenderConfig()))
-        self._build(grid, grid.counts(mask) > 0)
+        vars(self).update(vars(Region.of(grid, grid.counts(mask) > 0)))
 
     @classmethod
     def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> Region:
@@ -99,12 +99,14 @@ class Region:
 
         Args:
             grid: all blocks of the view.
-            blocks: the requested ones, bool [rows, columns].
+            blocks: the requested ones, bool [rows, columns], of all views.
             whole: whether images are [H, W, C]; all blocks must be requested.
             views: number of equal views, one below the other; several must be whole.
         """
         region = cls.__new__(cls)
-        region._build(grid, blocks, whole, views)
+        region._lay_out(grid, blocks, whole, views)
+        pixels = np.ones((region.height, region.width), bool)
+        region._weigh(np.ones((), bool) if whole else region.crop(pixels))
         return region
 
     # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in
@@ -126,24 +128,20 @@ class Region:
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
     _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
-    def _build(
-        self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1
-    ) -> None:
-        self.grid = grid
-        self.width = grid.width
-        self.block = grid.block
-        self.whole = whole
-        self.height = views * grid.height
-        self.across, self.down = grid.tiles
-        self._lay_out(np.tile(blocks, (views, 1)))
-        mask = np.ones((), bool) if whole else self.crop(np.ones((self.height, self.width), bool))
+    def _weigh(self, mask: np.ndarray) -> None:
+        """Set the weights from the mask of an image's pixels that are in the view."""
         self.weights = None if mask.all() else from_numpy(mi.Float, mask)
 
-    def _lay_out(self, blocks: np.ndarray) -> None:
-        """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows
-        of tiles.
-        """
-        bw, bh = self.block
+    def _lay_out(
+        self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1
+    ) -> None:
+        """Number the blocks; a second view begins after the rows of tiles of a grid."""
+        self.grid = grid
+        self.width = grid.width
+        self.height = views * grid.height
+        self.block = bw, bh = grid.block
+        self.whole = whole
+        self.across, self.down = grid.tiles
         active = blocks.reshape(-1, DOWN, self.across, ACROSS).transpose(0, 2, 1, 3)
         active = active.reshape(-1, ACROSS * DOWN)
         tiles = np.flatnonzero(active.any(1))
@@ -265,22 +263,18 @@ def joined(regions: Sequence[Region]) -> Region:
     Its images are the regions' images, one after the other. Blocks keep the pixel coordinates of
     their view.
     """
+    bw, bh = regions[0].block
+    rows, columns = np.max([part.drawn.shape for part in regions], axis=0).tolist()
     region = Region.__new__(Region)
-    region.block = regions[0].block
-    region.whole = False
-    grids = [part.drawn for part in regions]
-    region.across = max(part.across for part in regions)
-    region.down = max(part.down for part in regions)
-    rows = region.down * DOWN
-    columns = region.across * ACROSS
-    region.width = columns * region.block[0]
-    region.height = len(regions) * rows * region.block[1]
     blocks = [
-        np.pad(grid, ((0, rows - grid.shape[0]), (0, columns - grid.shape[1]))) for grid in grids
+        np.pad(part.drawn, [(0, rows - part.drawn.shape[0]), (0, columns - part.drawn.shape[1])])
+        for part in regions
     ]
-    region._lay_out(np.concatenate(blocks))
-    mask = np.concatenate([part.crop(np.ones((part.height, part.width), bool)) for part in regions])
-    region.weights = None if mask.all() else from_numpy(mi.Float, mask)
+    grid = BlockGrid(columns * bw, rows * bh, (bw, bh))
+    region._lay_out(grid, np.concatenate(blocks), views=len(regions))
+    region._weigh(
+        np.concatenate([part.crop(np.ones((part.height, part.width), bool)) for part in regions])
+    )
     return region
 
 
@@ -326,4 +320,4 @@ def full_view(
     """
     grid = BlockGrid(width, height, block)
     blocks = grid.counts(np.ones((height, width), bool)) > 0
-    return Region.of(grid, blocks, whole=True, views=views)
+    return Region.of(grid, np.tile(blocks, (views, 1)), whole=True, views=views)

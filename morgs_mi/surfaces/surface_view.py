@@ -361,10 +361,8 @@ def coverage_and_depth(
     edge: Any = dr.compress(is_mixed)
     if dr.width(edge):
         more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
-        more = more + dr.gather(mi.Float, count, edge)
-        deeper = deeper + dr.gather(mi.Float, total, edge)
-        for target, values in ((count, more), (total, deeper), (rays, mi.Float(_GRID**2))):
-            dr.scatter(target, values, edge, mode=dr.ReduceMode.Permute)
+        for target, values in ((count, more), (total, deeper), (rays, mi.Float(len(_OTHERS)))):
+            dr.scatter_add(target, values, edge)
     dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
     dr.scatter(
         depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute
