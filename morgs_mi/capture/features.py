@@ -14,7 +14,6 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from morgs_mi.capture.lens import image_coordinates
 from morgs_mi.core.camera import Camera
 
 # Larger images add no corners that other views also see, and SIFT is slow.
@@ -98,7 +97,8 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic
     # 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
-    colors = values_at(image, points).astype(np.float32) / 255
+    columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
+    colors = image[rows, columns].astype(np.float32) / 255
     angles, sizes = np.array([(np.deg2rad(k.angle), k.size) for k in keypoints]).T
     axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return Features(points, descriptors, colors, axes * pixel_scale)
@@ -107,12 +107,6 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
 def _no_features() -> Features:
     points = np.zeros((0, 2))
     return Features(points, np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), points)
-
-
-def values_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the values of the pixels of an image in which points [K, 2] lie."""
-    columns, rows = np.clip(points.astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
-    return image[rows, columns]
 
 
 def reduced_size(width: int, height: int, pixels: float) -> tuple[int, int]:
@@ -269,30 +263,24 @@ def intersect(
 
     Observation k is the pixel position `pixels[k]` of point `track[k]` in view `views[k]`.
     """
-    V, middle, scale = _relative_poses(cameras)
+    # Poses relative to the rig's centre and size make a system of equations well conditioned.
+    positions = np.array([camera.position for camera in cameras])
+    middle = positions.mean(0)
+    scale = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
+    V[:, :, 3] = (V[:, :, :3] @ middle + V[:, :, 3]) / scale
     V = V[views]
     x = np.empty_like(pixels)  # at depth 1
     for view in np.unique(views):
         of_view = views == view
-        x[of_view] = image_coordinates(cameras[view], pixels[of_view])
+        K = cameras[view].K
+        x[of_view] = (pixels[of_view] - K[:2, 2]) / np.diag(K)[:2]
     rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
     system = np.zeros((count, 4, 4))
     np.add.at(system, track, np.einsum("kri,krj->kij", rows, rows))
     solution = np.linalg.eigh(system)[1][:, :, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         return solution[:, :3] / solution[:, 3:] * scale + middle
-
-
-def _relative_poses(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the poses [C, 3, 4] relative to the rig's centre and size, which make a system of
-    equations well conditioned, the centre [3] and the size.
-    """
-    positions = np.array([camera.position for camera in cameras])
-    middle = positions.mean(0)
-    scale = np.linalg.norm(positions - middle, axis=1).max() or 1.0
-    V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
-    V[:, :, 3] = (V[:, :, :3] @ middle + V[:, :, 3]) / scale
-    return V, middle, scale
 
 
 def intersect_pairs(

@@ -140,29 +140,15 @@ def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     mask = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
-    return x, y, mask & ~_folded(x, y, camera)
-
-
-def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the mask of pixels beyond the angle up to which the lens model is valid [H, W].
-
-    A polynomial that was fitted to the recorded rays decreases again farther out. It would mirror
-    the inner part of the image there.
-    """
-    # Sampling every few pixels is accurate enough, and fast.
+    if min(size) < 2:
+        return x, y, mask
+    # A polynomial that was fitted to the recorded rays decreases again farther out, where it would
+    # mirror the inner part of the image. Sampling every few pixels is accurate enough, and fast.
     step = max(1, min(x.shape) // 256)
-    coarse = x[::step, ::step], y[::step, ::step]
-    if min(coarse[0].shape) < 2:
-        return np.zeros(x.shape, bool)
-    (x_down, x_right), (y_down, y_right) = map(np.gradient, coarse)
+    (x_down, x_right), (y_down, y_right) = (np.gradient(v[::step, ::step]) for v in (x, y))
     fold = x_right * y_down - x_down * y_right <= 0
-    # Distance from the optical axis at depth 1: x depends on the column only, y on the row only.
-    across = (np.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
-    down = (np.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    # Distance from the optical axis at depth 1.
+    across = (np.arange(camera.width) - K[0, 2]) / K[0, 0]
+    down = (np.arange(camera.height) - K[1, 2]) / K[1, 1]
     radius = np.hypot(across, down[:, None])
-    return radius >= np.min(radius[::step, ::step][fold], initial=np.inf)
-
-
-def image_coordinates(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return the image coordinates x / z, y / z [n, 2] of pixels, in the camera's axes."""
-    return (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    return x, y, mask & (radius < np.min(radius[::step, ::step][fold], initial=np.inf))

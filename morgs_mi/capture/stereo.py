@@ -118,8 +118,9 @@ class _Rectified:
     axes: np.ndarray  # axes of the plane, rows right, down and forward in the world [3, 3]
     focal: float  # focal length, px
     baseline: float  # distance of the cameras, world units
-    # mappings from the pixels of each view to the pixels of its rectified image
-    homographies: tuple[np.ndarray, np.ndarray]
+    # mappings from the pixels of each view to the pixels of its rectified image, for OpenCV, whose
+    # pixel centres lie at whole numbers
+    homographies: list[np.ndarray]
     # position of each image's first column relative to the optical axis, px, and of their first row
     corners: tuple[float, float, float]
     size: tuple[int, int]  # width and height of both images
@@ -152,48 +153,12 @@ class _Rectified:
         bottom = min(ay.max(), by.max())
         size = int(np.ceil(max(np.ptp(ax), np.ptp(bx)))), int(np.ceil(bottom - top))
         starts = (ax.min(), bx.min(), top)
-        homographies = (
-            _shift(-starts[0], -top) @ to_plane[0],
-            _shift(-starts[1], -top) @ to_plane[1],
-        )
+        homographies = [
+            _shift(-0.5, -0.5) @ (_shift(-start, -top) @ H) @ _shift(0.5, 0.5)
+            for start, H in zip(starts, to_plane, strict=False)
+        ]
         baseline = float(np.linalg.norm(b.position - a.position))
         return cls(axes, focal, baseline, homographies, starts, size)
-
-    @property
-    def shift(self) -> float:
-        """Disparity of infinitely distant points, px."""
-        return self.corners[1] - self.corners[0]
-
-    def disparity_range(self, depths: tuple[float, float]) -> tuple[int, int]:
-        """Return the lowest disparity and the number of disparities in a range of depths."""
-        product = self.focal * self.baseline
-        lowest = int(np.floor(product / depths[1] + self.shift))
-        steps = product / depths[0] + self.shift - lowest + 1
-        return lowest, 16 * max(1, int(np.ceil(steps / 16)))
-
-    def is_useful(self, count: int, pixels: int) -> bool:
-        """Return whether `count` disparities can be searched, given the pixels of a view: strongly
-        converging cameras have no useful plane in common.
-        """
-        width, height = self.size
-        return min(width, height) >= 2 * _BLOCK and count <= width and width * height <= 4 * pixels
-
-    def points(self, disparity: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return the points [P, 3] relative to the first camera at the pixels in `mask` [H, W]."""
-        rows, columns = np.nonzero(mask)
-        depth = self.focal * self.baseline / (disparity[mask] - self.shift)
-        x = columns + 0.5 + self.corners[0]
-        y = rows + 0.5 + self.corners[2]
-        return np.stack([x * depth / self.focal, y * depth / self.focal, depth], axis=1) @ self.axes
-
-    def warped(
-        self, index: int, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR
-    ) -> np.ndarray:
-        """Return an image of one of the views, rectified; OpenCV's pixel centres lie at whole
-        numbers.
-        """
-        H = _shift(-0.5, -0.5) @ self.homographies[index] @ _shift(0.5, 0.5)
-        return cv2.warpPerspective(image, H, self.size, flags=interpolation)
 
 
 def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
@@ -201,21 +166,30 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     rig = _Rectified.of(a.camera, b.camera)
     if rig is None:
         return np.zeros((0, 6))
-    lowest, count = rig.disparity_range(depths)
-    if not rig.is_useful(count, a.valid.size):
+    # The lowest disparity, and the number of disparities, of these depths.
+    product = rig.focal * rig.baseline
+    shift = rig.corners[1] - rig.corners[0]  # disparity of infinitely distant points, px
+    lowest = int(np.floor(product / depths[1] + shift))
+    steps = product / depths[0] + shift - lowest + 1
+    count = 16 * max(1, int(np.ceil(steps / 16)))
+    # Strongly converging cameras have no useful plane in common.
+    width, height = rig.size
+    if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.valid.size:
         return np.zeros((0, 6))
-    left = rig.warped(0, a.image)
-    right = rig.warped(1, b.image)
+    left, right = map(cv2.warpPerspective, (a.image, b.image), rig.homographies, [rig.size] * 2)
     forth = _disparity(left, right, lowest, count)
     back = _disparity(right, left, 1 - lowest - count, count)
-    valid = [rig.warped(k, view.valid, cv2.INTER_NEAREST) > 0 for k, view in enumerate((a, b))]
-    mask = (
-        _consistency_mask(forth, back, valid[1])
-        & (forth >= lowest)
-        & (forth - rig.shift > 0)
-        & valid[0]
-    )
-    points = rig.points(forth, mask) + a.camera.position
+    valid = [
+        cv2.warpPerspective(view.valid, H, rig.size, flags=cv2.INTER_NEAREST) > 0
+        for view, H in zip((a, b), rig.homographies, strict=True)
+    ]
+    mask = _consistency_mask(forth, back, valid[1]) & valid[0]
+    mask &= (forth >= lowest) & (forth - shift > 0)
+    rows, columns = np.nonzero(mask)
+    depth = product / (forth[mask] - shift)
+    x = (columns + 0.5 + rig.corners[0]) * depth / rig.focal
+    y = (rows + 0.5 + rig.corners[2]) * depth / rig.focal
+    points = np.stack([x, y, depth], axis=1) @ rig.axes + a.camera.position
     return np.concatenate([points, left[mask] / 255.0], axis=1)
 
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,7 +40,7 @@ from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import errors_at, few
-from morgs_mi.core.files import write_error
+from morgs_mi.core.files import atomic_path
 from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.video import natural_key
 
@@ -183,19 +183,13 @@ def write_colmap(
     for i, (xyz, rgb) in enumerate(zip(points, colors, strict=True), start=1):
         # The error of a point is not known, and its track is empty.
         point_lines.append(_line(i, *xyz.tolist(), *rgb.tolist(), 0.0))
-    # The cameras are the last file that is renamed, because readers look for it.
-    texts = {"images": image_lines, "points3D": point_lines, "cameras": camera_lines}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
-            for name, lines in texts.items():
-                (Path(partial) / f"{name}.txt").write_text("".join(lines), encoding="utf-8")
-            for name in texts:
-                (Path(partial) / f"{name}.txt").replace(folder / f"{name}.txt")
-    except OSError as error:
-        raise write_error(
-            f"{folder}: the COLMAP model could not be written", error, folder
-        ) from error
+    # The first file is the last one that is renamed, because readers look for it.
+    texts = {"cameras": camera_lines, "images": image_lines, "points3D": point_lines}
+    with ExitStack() as files:
+        for name, lines in texts.items():
+            partial = files.enter_context(atomic_path(folder / f"{name}.txt", "write_colmap()"))
+            partial.parent.mkdir(parents=True, exist_ok=True)
+            partial.write_text("".join(lines), encoding="utf-8")
 
 
 def _line(*fields: object) -> str:
