@@ -36,7 +36,6 @@ def used_in_clip(
     width = reader.width
     height = reader.height
     used_mask = np.ones((height, width), bool)
-    varies = False  # whether a later image masks out more than those before it
     for file in files:
         existing_file(file, "a mask", "copy it, or drop `mask_path`")
         image = np.atleast_3d(decode_image(file, cv2.IMREAD_UNCHANGED)) > 0
@@ -47,12 +46,10 @@ def used_in_clip(
             raise ValueError(
                 f"{file}: expected a mask of {width}x{height}, or scaled, got {columns}x{rows}."
             )
-        mask = scaled_mask(mask, width, height)
-        varies = varies or (file != files[0] and bool((used_mask & ~mask).any()))
-        used_mask &= mask
+        used_mask &= scaled_mask(mask, width, height)
     if not used_mask.all():
-        several = f": all that any of {len(files)} different masks has black"
-        origin = several if varies else f" by {files[0].name}"
+        several = f": all that any of {len(files)} masks has black"
+        origin = several if len(files) > 1 else f" by {files[0].name}"
         notes.append(f"{name}: {_unused(used_mask)} % of its pixels are masked out{origin}.")
     if opaque is not None:
         used_mask &= opaque

@@ -36,12 +36,12 @@ from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
 
 _CHUNK = 256
 _BOUNDS = {
-    "position": (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),
-    "scale": (
-        ("min_scale_x", "min_scale_y", "min_scale_z"),
-        ("max_scale_x", "max_scale_y", "max_scale_z"),
-    ),
-    "color": (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
+    key: [[f"{end}_{name}" for name in names] for end in ("min", "max")]
+    for key, names in {
+        "position": ("x", "y", "z"),
+        "scale": ("scale_x", "scale_y", "scale_z"),
+        "color": ("r", "g", "b"),
+    }.items()
 }
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ_BITS = (11, 10, 11)
@@ -98,9 +98,7 @@ def _chunks(raw: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarra
         value = value.astype(np.float32)
         bounds = []
         for names, bound in zip(_BOUNDS[key], (np.minimum, np.maximum), strict=True):
-            ends = value
-            if len(value):
-                ends = bound.reduceat(value, np.arange(0, len(value), _CHUNK), axis=0)
+            ends = bound.reduceat(value, np.arange(0, len(value), _CHUNK), axis=0)
             for name, column in zip(names, ends.T, strict=True):
                 chunks[name] = column
             bounds.append(_by_row(ends, len(value)))

@@ -29,6 +29,7 @@ from plyfile import PlyData, PlyElement
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.geometry import unit_quats
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply_kinds import as_3dgs
 
@@ -87,10 +88,6 @@ def write_ply(
     if layout not in ("3dgs", "mitsuba"):
         raise ValueError(f"write_ply(): `layout` must be 3dgs or mitsuba, got {layout!r}.")
     raw = gaussians.numpy()
-    lengths = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
-    unit_quats = raw["quats"] / np.maximum(lengths, 1e-30)
-    # A zero quaternion is no rotation.
-    rotations = np.where(lengths > 0, unit_quats, (1, 0, 0, 0))
     columns = {_MEAN: raw["means"], _NORMAL: np.zeros_like(raw["means"])}
     N, K = raw["sh_coeffs"].shape[:2]
     if layout == "mitsuba":
@@ -103,7 +100,7 @@ def write_ply(
         rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
         columns[rest_names(K)] = rest
         columns[("opacity",)] = raw["logit_opacities"][:, None]
-    columns |= {_SCALE: raw["log_scales"], _ROTATION: rotations}
+    columns |= {_SCALE: raw["log_scales"], _ROTATION: unit_quats(gaussians)}
     names = [name for names in columns for name in names]
     table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
     vertices = table.astype("<f4").view([(name, "<f4") for name in names])[:, 0]

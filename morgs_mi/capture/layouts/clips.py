@@ -24,6 +24,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import imagesize
 
@@ -33,6 +34,7 @@ from morgs_mi.io.numbering import check_numbering, frame_numbers
 from morgs_mi.io.video import Clip, natural_key, open_frames
 
 _LOG = logging.getLogger(__name__)
+_Clip = TypeVar("_Clip", Path, tuple[Path])
 
 EXAMPLE = (
     "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, "
@@ -87,11 +89,14 @@ def clips_by_rig(path: Path) -> dict[str, Path]:
 
 def photos_by_rig(path: Path) -> dict[str, tuple[Path]]:
     """Return the photos in folders of folders as `clips_by_rig`, each as a clip of one frame."""
-    images = _by_rig(path, lambda folder: _by_stem(images_in(folder)))
-    return {name: (image,) for name, image in images.items()}
+    return _by_rig(path, _photos)
 
 
-def _by_rig(path: Path, clips: Callable[[Path], dict[str, Path]]) -> dict[str, Path]:
+def _photos(folder: Path) -> dict[str, tuple[Path]]:
+    return {name: (image,) for name, image in _by_stem(images_in(folder)).items()}
+
+
+def _by_rig(path: Path, clips: Callable[[Path], dict[str, _Clip]]) -> dict[str, _Clip]:
     """Return the `clips` of the folders in a capture and in its folders."""
     rigs = [rig for place in (path, *_places(path)) for rig in _places(place)]
     clips_of_rigs = [(rig.name, *clip) for rig in rigs for clip in clips(rig).items()]
@@ -117,8 +122,7 @@ def photos(path: Path) -> dict[str, tuple[Path]]:
         ValueError: two images differ only in their suffixes.
     """
     folder = _image_folder(path)
-    images = _in_order(_by_stem(images_in(folder))) if folder else {}
-    return {name: (image,) for name, image in images.items()}
+    return _in_order(_photos(folder)) if folder else {}
 
 
 def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
@@ -134,7 +138,7 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
     return {name: tuple(f / image.name for f in frames) for name, image in images.items()}
 
 
-def _in_order(files: Mapping[str, Path]) -> dict[str, Path]:
+def _in_order(files: Mapping[str, _Clip]) -> dict[str, _Clip]:
     """Return the files in the numerical order of their names."""
     return {name: files[name] for name in sorted(files, key=natural_key)}
 
@@ -147,19 +151,6 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
     """
     folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
     check_numbering(path, frame_numbers(path, folders), folders)
-
-
-def names_without(path: Path, names: Collection[str], without: Collection[str]) -> list[str]:
-    """Return the names of the cameras except `without`; `path` is the capture, for messages.
-
-    Raises:
-        ValueError: a camera that is left out does not exist, or all are left out.
-    """
-    check_names(path, "without", without, names)
-    rest = [name for name in names if name not in without]
-    if without and not rest:
-        raise ValueError(f"{path}: `without` must leave at least one camera, got all.")
-    return rest
 
 
 def check_names(place: Path, setting: str, names: Iterable[str], cameras: Collection[str]) -> None:

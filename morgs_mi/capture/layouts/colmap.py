@@ -123,7 +123,14 @@ def read_colmap(folder: str | Path) -> ColmapModel:
             if camera_id not in intrinsics:
                 raise ValueError(f"it refers to camera {camera_id}, of {few(sorted(intrinsics))}")
             lens, K, width, height = intrinsics[camera_id]
-            cameras.append(Camera(K, _viewmat(pose), width, height, name))
+            quat = np.array(pose[:4])
+            # COLMAP writes quaternions of length 1.
+            if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
+                raise ValueError(f"its quaternion must have length 1, got {[*pose]}; correct it.")
+            viewmat = np.eye(4)
+            viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
+            viewmat[:3, 3] = pose[4:]
+            cameras.append(Camera(K, viewmat, width, height, name))
             lenses.append(lens)
         check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
     if not cameras:
@@ -194,20 +201,6 @@ def write_colmap(
 
 def _line(*fields: object) -> str:
     return " ".join(map(str, fields)) + "\n"
-
-
-def _viewmat(pose: Sequence[float]) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
-    quat = np.array(pose[:4])
-    # COLMAP writes quaternions of length 1.
-    if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
-        raise ValueError(
-            f"its quaternion must have length 1, got {[*pose]}; check the order of the columns."
-        )
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
-    viewmat[:3, 3] = pose[4:]
-    return viewmat
 
 
 def _read_calibration(path: Path) -> Calibration:

@@ -42,19 +42,16 @@ _IMAGE_POINTS = "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line"
 _POINT = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
 _POINT_BYTES = "<Q3d3BdQ"
 _COUNT = "<Q"
-# The least bytes of an image in a binary model.
-_LEAST_IMAGE = 73
 # More values than a line of any camera model has in a text file.
 _MAX_CAMERA_FIELDS = 20
 
 
 def count_images(folder: Path) -> int:
     """Return the number of images in the COLMAP model in `folder`; 0 if it cannot be read."""
+    is_binary = (folder / "cameras.bin").exists()
     with suppress(OSError, ValueError):
-        if (folder / "cameras.bin").exists():
-            file = _Bytes(folder / "images.bin")
-            return min(*file.take(_COUNT), len(file.data) // _LEAST_IMAGE)
-        return sum(1 for _ in text_images(folder / "images.txt"))
+        images = binary_images if is_binary else text_images
+        return sum(1 for _ in images(folder / f"images.{'bin' if is_binary else 'txt'}"))
     return 0
 
 
