@@ -59,15 +59,10 @@ class Registry(Generic[Made, Config]):
         return add
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The names that take no argument, in the order of their registration."""
-        return tuple(name for name, (argument, _) in self._entries.items() if not argument)
-
-    @property
     def usages(self) -> tuple[str, ...]:
         """Values of the setting: names without an argument, then NAME:ARGUMENT of the others."""
-        others = (f"{name}:{text}" for name, (text, _) in self._entries.items() if text)
-        return (*self.names, *others)
+        entries = sorted(self._entries.items(), key=lambda entry: bool(entry[1][0]))
+        return tuple(f"{name}:{text}" if text else name for name, (text, _) in entries)
 
     def make(self, text: str, config: Config | None = None) -> Made:
         """Return the implementation that `text` selects; None: with the defaults.

@@ -83,7 +83,6 @@ class Target:
             self.pixels = self.masked(self.pixels)
             dr.eval(self.pixels)
         self.surroundings: Float | None = None
-        self._image: np.ndarray | None = None
         self._places: dict[Region, tuple[UInt32, Bool]] = {}
         self._windows: dict[Region | None, _Windows] = {}
 
@@ -100,13 +99,8 @@ class Target:
         return planes
 
     def image(self) -> np.ndarray:
-        """Return the target [H, W, 3], float32 with white at 1; black where masked. It is
-        read-only.
-        """
-        if self._image is None:
-            self._image = np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
-            self._image.flags.writeable = False
-        return self._image
+        """Return the target [H, W, 3], float32 with white at 1; black where masked."""
+        return np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
 
     def difference(self, image: Tensor) -> np.ndarray:
         """Return the target minus an image, [H, W, 3]; 0 where masked."""

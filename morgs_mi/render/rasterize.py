@@ -159,10 +159,8 @@ def rasterize(
     is_stack = isinstance(camera, Sequence)
     cameras = tuple(camera) if is_stack else (camera,)
     options = {"background": background, "features": features, "config": config}
-    of_one_view = {"region": region, "static_splats": static_splats, "depth_limit": depth_limit}
-    for problem in _problems(
-        gaussians, cameras, channels, detach_weights, options, of_one_view, is_stack
-    ):
+    options |= {"region": region, "static_splats": static_splats, "depth_limit": depth_limit}
+    for problem in _problems(gaussians, cameras, channels, detach_weights, options, is_stack):
         raise ValueError(f"rasterize(): {problem}.")
     channels = tuple(dict.fromkeys(channels))
     sizes = {**channel_sizes(), "alpha": 1}
@@ -180,8 +178,16 @@ def rasterize(
         region = full_view(view.width, view.height, block_shape(config), len(cameras), mi.variant())
     stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
+
+    def empty_image() -> Image:
+        images = {name: dr.zeros(mi.TensorXf, (*stack, sizes[name])) for name in channels}
+        if background is not None and "color" in images:
+            zeros = dr.zeros(mi.Float, prod((*stack, 3)))
+            images["color"] = _tensor(_over(background, zeros, zeros), region, (*stack, 3))
+        return _image(images)
+
     if dr.prod(gaussians.means.shape[:1]) == 0:
-        return _empty(channels, sizes, background, region, stack)
+        return empty_image()
     cut = limits is not None
     projected = (*blended, "profile") if cut else blended
     rows = None
@@ -193,7 +199,7 @@ def rasterize(
             _check_finite(bare.finite, gaussians, cameras, features)
             rows = dr.compress(visible)
         if not dr.width(rows):
-            return _empty(channels, sizes, background, region, stack)
+            return empty_image()
     parts = [project(gaussians, part, projected, config, rows, features) for part in cameras]
     splats = parts[0] if len(parts) == 1 else _stacked(parts)
     if static_splats is not None:
@@ -271,28 +277,12 @@ def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:
     return mi.TensorXf(values, shape)
 
 
-def _empty(
-    channels: tuple[str, ...],
-    sizes: Mapping[str, int],
-    background: Sequence[float] | Jit | None,
-    region: Region,
-    shape: tuple[int, ...],
-) -> Image:
-    """Return the image of no Gaussians; `shape` is that of a tensor without its channels."""
-    images = {name: dr.zeros(mi.TensorXf, (*shape, sizes[name])) for name in channels}
-    if background is not None and "color" in images:
-        zeros = dr.zeros(mi.Float, prod((*shape, 3)))
-        images["color"] = _tensor(_over(background, zeros, zeros), region, (*shape, 3))
-    return _image(images)
-
-
 def _problems(
     gaussians: ActivatedGaussians,
     cameras: Sequence[Camera],
     channels: Sequence[str],
     detach_weights: Sequence[str],
     options: Mapping[str, Any],
-    of_one_view: Mapping[str, Any],
     is_stack: bool,
 ) -> Iterator[str]:
     """Yield a sentence for each argument of `rasterize` that is refused; a later one relies on the
@@ -303,8 +293,7 @@ def _problems(
         cameras: the view, or all of them.
         channels: to render.
         detach_weights: channels.
-        options: background, features and config.
-        of_one_view: region, static splats and depth limit, which several cameras cannot have.
+        options: the other arguments, by name.
         is_stack: whether a sequence of cameras was given.
     """
     if not hasattr(gaussians, "means"):
@@ -356,7 +345,7 @@ def _problems(
         remedy = "render a smaller one, or tiles, one camera each"
         check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
-    background = options["background"]
+    background, features, config, region, static_splats, depth_limit = options.values()
     behind = np.asarray(dr.detach(background)).ravel() if dr.is_array_v(background) else background
     if behind is not None and not (
         np.shape(behind) == (3,)
@@ -366,22 +355,19 @@ def _problems(
             "`background` must be three finite numbers of at most 1e18, got "
             f"{background!r}; pass a colour or None"
         )
-    config = options["config"]
     check_type("rasterize()", "config", config, RenderConfig)
-    region, static_splats, depth_limit = (
-        of_one_view[name] for name in ("region", "static_splats", "depth_limit")
-    )
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
-    for name, value in of_one_view.items():
+    for name in ("region", "static_splats", "depth_limit"):
+        value = options[name]
         if is_stack and value is not None:
             yield (
                 f"`{name}` must be None with a sequence of cameras, got a {type(value).__name__}; "
                 "render one camera at a time"
             )
-    if options["features"] is not None:
-        shape = tuple(float_tensor("rasterize()", "features", options["features"]).shape)
+    if features is not None:
+        shape = tuple(float_tensor("rasterize()", "features", features).shape)
         N = int(gaussians.means.shape[0])
         if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
             yield (

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -42,7 +41,6 @@ _SETTINGS = (
 )
 
 
-@dataclass(frozen=True)
 class _SceneGaussians:
     """The Gaussians of all shapes, in the scene's order (see `ActivatedGaussians`)."""
 
@@ -53,6 +51,9 @@ class _SceneGaussians:
     sh_coeffs: Tensor
     motion: Tensor = None
     confidence: Tensor = None
+
+    def __init__(self, tensors: dict[str, Tensor]) -> None:
+        vars(self).update(tensors)
 
     def rows(self, name: str, index: UInt32) -> list[Float]:
         """Return rows of an attribute, see `ActivatedGaussians`."""
@@ -72,7 +73,7 @@ def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
             part["sh_coeffs"] = dr.concat([part["sh_coeffs"], zeros], axis=1)
     if len(parts) > 1:
         parts = [{name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}]
-    return _SceneGaussians(**parts[0])
+    return _SceneGaussians(parts[0])
 
 
 def _property_problems(background: Any, aovs: list[str], surfaces: Any) -> Iterator[str]:
