@@ -14,11 +14,11 @@ import numpy as np
 from morgs_mi.capture.layouts.clips import (
     EXAMPLE,
     check_frames,
-    check_names,
     clip_of_camera,
     clips_by_camera,
     clips_by_frame,
     clips_by_rig,
+    names_without,
     photos,
     photos_by_rig,
     view_of_image,
@@ -95,10 +95,7 @@ class Calibration:
         Raises:
             ValueError: there is no such camera, or none is left.
         """
-        check_names(path, "without", names, self.names)
-        indices = [index for index, name in enumerate(self.names) if name not in names]
-        if not indices:
-            raise ValueError(f"{path}: `without` must leave at least one camera, got all.")
+        indices = [self.names.index(name) for name in names_without(path, self.names, names)]
         views = self.test_views
         return replace(
             self,

@@ -153,6 +153,19 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
     check_numbering(path, frame_numbers(path, folders), folders)
 
 
+def names_without(path: Path, names: Collection[str], without: Collection[str]) -> list[str]:
+    """Return the names of the cameras except `without`; `path` is the capture, for messages.
+
+    Raises:
+        ValueError: a camera that is left out does not exist, or all are left out.
+    """
+    check_names(path, "without", without, names)
+    rest = [name for name in names if name not in without]
+    if without and not rest:
+        raise ValueError(f"{path}: `without` must leave at least one camera, got all.")
+    return rest
+
+
 def check_names(place: Path, setting: str, names: Iterable[str], cameras: Collection[str]) -> None:
     """Raise an error unless a setting names cameras; `place` is where it was set.
 
