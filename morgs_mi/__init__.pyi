@@ -28,7 +28,7 @@ from .runs.fit_capture import stream_capture
 from .stream_loop import StreamLoop
 from .studio.light.light_probe import light_probe
 from .studio.light.shadows import shadow_ratio, shadowed
-from .studio.live.live_frames import live_frames
+from .studio.live.sources import live_frames
 from .studio.sweep import leave_out, sweep
 from .studio.synth.synth_config import SynthConfig
 from .studio.synth.synthesize import synthesize

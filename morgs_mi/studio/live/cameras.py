@@ -8,11 +8,12 @@ import atexit
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from threading import Condition, Event, Thread
 
 import numpy as np
 
-from morgs_mi.studio.live.feed import FrameSet, Shot, close_images
+from morgs_mi.core.checks import require
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver
 # them in bursts.
@@ -20,6 +21,35 @@ _KEPT = 4
 # Largest skew of a frame set, s: the skew of unsynchronised cameras with one image per second.
 _MAX_SKEW = 0.5
 _CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may take 10 s to fail
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image of one camera."""
+
+    image: np.ndarray  #: uint8 [H, W, 3], RGB.
+    time: float  #: At which it arrived, s of `time.monotonic`.
+    number: int  #: Its number among the camera's images, without gaps.
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSet:
+    """Images of the cameras at about one time."""
+
+    #: Per camera uint8 [H, W, 3], RGB, None where it has none.
+    images: tuple[np.ndarray | None, ...]
+    #: Per camera the number of its image, or of its newest one before where it has none.
+    numbers: tuple[int, ...]
+    time: float  #: At which the last of the images arrived, s of `time.monotonic`.
+    skew: float  #: Largest difference in time between two of the images, s.
+    #: Number of images that each camera delivered after the frame set before and that are in none.
+    dropped: int
+
+
+def close_images(images: object) -> None:
+    """End an iterator of images, if it is one that can be ended."""
+    if (close := getattr(images, "close", None)) is not None:
+        close()
 
 
 class CameraFeed:
@@ -82,14 +112,15 @@ class CameraFeed:
                     return frame_set
                 if is_running and time_left > 0:
                     self._change.wait(time_left)
-                elif after is not None:
-                    return None
                 else:
-                    raise ValueError(
-                        f"CameraFeed(): expected simultaneous images of {', '.join(self.names)}, "
-                        f"got none that arrived within {_MAX_SKEW:g} s of each other; start the "
-                        "cameras together."
+                    require(
+                        after,
+                        "CameraFeed()",
+                        f"expected simultaneous images of {', '.join(self.names)}",
+                        f"none that arrived within {_MAX_SKEW:g} s of each other",
+                        "start the cameras together",
                     )
+                    return None
 
     def problem(self, camera: int) -> str:
         """Return why a camera has no image in the last frame set."""
@@ -119,10 +150,15 @@ class CameraFeed:
             [shot for shot in camera.shots if shot.number > number]
             for camera, number in zip(self._cameras, numbers, strict=True)
         ]
+        # The first images have to be complete, and so have the last ones. Otherwise a camera that
+        # runs is waited for, unless it is late or was missing before; an image of another has to be
+        # of the time of the newest.
+        recent = _simultaneous(new)
+        expected = [after is None or after.images[k] is not None for k in range(len(new))]
         if after is not None and is_running:
-            expected = self._expected(new, after, late)
-        else:  # the first images have to be complete, and so have the last ones
-            expected = [after is None or after.images[k] is not None for k in range(len(new))]
+            for k, camera in enumerate(self._cameras):
+                is_awaited = not late and camera.reason is None
+                expected[k] = expected[k] or bool(new[k]) if is_awaited else recent[k]
         shots = _nearest(new, expected)
         if shots is None:
             return None
@@ -140,22 +176,6 @@ class CameraFeed:
             0 if after is None else min(skipped),
         )
 
-    def _expected(
-        self, new: Sequence[Sequence[Shot]], frame_set: FrameSet, late: bool
-    ) -> list[bool]:
-        """Return for each camera whether the frame set has to have its image.
-
-        A camera that runs is waited for, unless it is late or was missing before; an image of
-        another has to be of the time of the newest.
-        """
-        waits = [not late and camera.reason is None for camera in self._cameras]
-        return [
-            image is not None or bool(shots) if wait else recent
-            for wait, image, shots, recent in zip(
-                waits, frame_set.images, new, _simultaneous(new), strict=True
-            )
-        ]
-
     def _wait_for_first(self) -> None:
         """Wait until every camera has had an image, and has adjusted its exposure.
 
@@ -169,12 +189,14 @@ class CameraFeed:
                 camera = self._cameras[k]
                 if camera.error is not None:
                     raise camera.error
-                if camera.reason is not None or time_left <= 0:
-                    raise ValueError(
-                        f"CameraFeed(): expected images of {self.names[k]}, got none "
-                        f"({camera.reason or 'it is silent'}); check that it records, or wait for "
-                        f"it longer than {self._timeout:g} s (--timeout)."
-                    )
+                require(
+                    camera.reason is None and time_left > 0,
+                    "CameraFeed()",
+                    f"expected images of {self.names[k]}",
+                    f"none ({camera.reason or 'it is silent'})",
+                    "check that it records, or wait for it longer than "
+                    f"{self._timeout:g} s (--timeout)",
+                )
             self._change.wait(time_left)
         # The warm-up, unless a camera ends.
         end = time.monotonic() + self._warm_up

@@ -2,24 +2,34 @@
 dropped.
 
 The frames of the stream are numbered in succession, since the loop and its stream know no others;
-the report has the time of each.
+the report has the time of each. The calibration and the fitted images are a capture like any other:
+a stream can be evaluated on it, and its frames fitted again.
 """
 
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import count
+from math import inf
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.core.files import locked_folder
+from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
+from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.layouts.reader_registry import find_reader
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.files import atomic_path, locked_folder, write_json
+from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.png import png_bytes
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.threads import in_background, map_in_threads
 from morgs_mi.loop.frame_report import FrameReport
@@ -27,9 +37,8 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.fit_capture import Prepared, push_frame
 from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.studio.live.cameras import CameraFeed
-from morgs_mi.studio.live.feed import FrameSet
-from morgs_mi.studio.live.live_capture import begin_capture, read_calibration, write_images
+from morgs_mi.studio.calibration.calibrate import calibrate
+from morgs_mi.studio.live.cameras import CameraFeed, FrameSet
 from morgs_mi.studio.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.studio.live.sources import Source, open_feed
 
@@ -82,7 +91,7 @@ def fit_live(
     """
     out = Path(out)
     live = live or LiveConfig()
-    live.check("fit_live()")
+    live.check()
     check_outputs(out)
     folder = out / "capture"
     if folder.exists():
@@ -90,11 +99,8 @@ def fit_live(
             f"{folder}: expected no capture, got that of an earlier fit; choose another "
             "folder for this one."
         )
-    calibration = None
-    names = None
-    if live.calibration is not None:
-        calibration = read_calibration(live.calibration).without(live.calibration, live.without)
-        names = [camera.name for camera in calibration.cameras]
+    calibration = None if live.calibration is None else read_calibration(live)
+    names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
         report("Waiting for the cameras", 0, 1)
@@ -108,42 +114,123 @@ def fit_live(
         )
 
 
-class _LiveFrames:
-    """Frames of a live capture, processed like the frames of any capture.
+def read_calibration(config: LiveConfig) -> Calibration:
+    """Return the cameras of an earlier capture of the same rig.
+
+    Raises:
+        FileNotFoundError, ValueError: it is missing or broken.
+    """
+    folder = config.calibration
+    if folder is None or not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder}: expected a calibrated capture of the cameras, found none; check the path."
+        )
+    calibration = find_reader(folder).read(folder)
+    if any(calibration.masks):
+        _LOG.warning("%s: its masks are not used by a live fit.", folder)
+    return calibration.without(folder, config.without)
+
+
+def begin_capture(
+    folder: Path,
+    names: Sequence[str],
+    images: Sequence[np.ndarray | None],
+    config: LiveConfig,
+    calibration: Calibration | None = None,
+    on_stage: Report | None = None,
+) -> Capture:
+    """Write the first images and the calibration of live cameras, and return the capture, which has
+    one frame.
 
     Args:
-        feed: the cameras.
-        capture: of their first images.
-        first: these images.
+        folder: is made, and must not exist.
+        names: names of the cameras.
+        images: one per camera, uint8 [H, W, 3], RGB.
         config: settings.
+        calibration: of the cameras; None: they are calibrated by the images.
+        on_stage: called with (name, done, total) of the calibration.
+
+    Raises:
+        OSError: the disk is full or not writable.
+        ValueError: the cameras cannot be calibrated, or the images do not have the calibrated
+            sizes.
+    """
+    try:
+        write_images(folder, names, images, 0)
+        write_json(folder / CAPTURE, {"fps": config.fps})
+        if calibration is not None:
+            write_colmap(
+                folder / "sparse" / "0",
+                calibration.cameras,
+                calibration.points,
+                calibration.point_colors,
+                calibration.lenses,
+            )
+        else:
+            try:
+                calibrate(folder, progress=on_stage)
+            except ValueError as error:
+                error.add_note(
+                    f"The images are in {folder}: calibrate them with morgs-mi calibrate, which "
+                    "has more options, and pass that folder with --calibration."
+                )
+                raise
+        # A camera may stop: later frames are read without its images.
+        return load_capture(
+            folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True)
+        )
+    except (OSError, ValueError) as error:
+        # The fit can be started again; images that cannot be calibrated stay.
+        if calibration is not None or isinstance(error, OSError):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def write_images(
+    folder: Path, names: Sequence[str], images: Sequence[np.ndarray | None], frame: int
+) -> None:
+    """Write the images of a frame into a capture, side by side.
+
+    Raises:
+        OSError: the disk is full or not writable.
     """
 
-    def __init__(
-        self, feed: CameraFeed, capture: Capture, first: FrameSet, config: LiveConfig
-    ) -> None:
-        self.capture = capture
-        self.config = config
-        self._feed = feed
-        self.first = first
-        self._missing_names: set[str] = set()
+    def write(view: int) -> None:
+        image = images[view]
+        if image is not None:
+            file = folder / names[view] / f"{frame:04d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(file, "fit_live()") as partial:
+                partial.write_bytes(png_bytes(image))
+
+    map_in_threads(write, range(len(names)))
+
+
+@dataclass
+class _LiveFrames:
+    """Frames of a live capture, processed like the frames of any capture."""
+
+    feed: CameraFeed  # cameras
+    capture: Capture  # capture of their first images
+    first: FrameSet  # these images
+    config: LiveConfig
+    missing_names: set[str] = field(default_factory=set)  # cameras without an image before
 
     def __iter__(self) -> Iterator[tuple[FrameSet, PartialFrame]]:
         """Yield whenever the next frame is asked for the newest images, as recorded and as
         processed.
         """
         frame_set = self.first
-        frame = 0
-        begin = float("inf")
-        while frame_set is not None and frame_set.time - begin <= (
-            self.config.seconds or float("inf")
-        ):
+        end = inf
+        for frame in count():
             yield frame_set, self._processed(frame_set, frame)
-            frame = frame + 1
-            begin = min(begin, time.monotonic())
-            if frame == self.config.frames:
+            end = min(end, time.monotonic() + (self.config.seconds or inf))
+            if frame + 1 == self.config.frames:
                 return
-            if (frame_set := self._feed.newest(frame_set)) is None:
-                _LOG.warning("the fit ends after frame %d: %s", frame - 1, self._feed.ended())
+            if (frame_set := self.feed.newest(frame_set)) is None:
+                _LOG.warning("the fit ends after frame %d: %s", frame, self.feed.ended())
+            if frame_set is None or frame_set.time > end:
+                return
 
     def _processed(self, frame_set: FrameSet, frame: int) -> PartialFrame:
         """Return the processed images of a frame set; a camera that has none, or none of its size,
@@ -154,13 +241,13 @@ class _LiveFrames:
         for k, image in enumerate(frame_set.images):
             recorded_size = self.capture.recorded_sizes[k]
             if image is None:
-                problems[names[k]] = self._feed.problem(k)
+                problems[names[k]] = self.feed.problem(k)
             elif (size := image.shape[1::-1]) != recorded_size:
                 sizes = (*recorded_size, *size)
                 problems[names[k]] = "expected an image of {}x{}, got {}x{}".format(*sizes)
-        for name in problems.keys() - self._missing_names:
+        for name in problems.keys() - self.missing_names:
             _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
-        self._missing_names = set(problems)
+        self.missing_names = set(problems)
 
         def process(view: int) -> np.ndarray | None:
             image = frame_set.images[view]

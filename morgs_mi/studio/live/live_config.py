@@ -8,6 +8,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+from morgs_mi.core.checks import require
 from morgs_mi.core.config import check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
@@ -52,16 +53,17 @@ class LiveConfig:
     choose.
     """
 
-    def check(self, place: str) -> None:
-        """Check the settings; an error's sentence begins with `place`.
+    def check(self) -> None:
+        """Check the settings.
 
         Raises:
             ValueError: one is out of range.
         """
-        if self.without and self.calibration is None:
-            raise ValueError(
-                f"{place}: `without` must name cameras of a calibration, got "
-                f"{', '.join(self.without)} and no calibration; name the sources that are used "
-                "(--camera)."
-            )
-        check_ranges(self, place)
+        require(
+            not self.without or self.calibration,
+            "fit_live()",
+            "`without` must name cameras of a calibration",
+            f"{', '.join(self.without)} and no calibration",
+            "name the sources that are used (--camera)",
+        )
+        check_ranges(self, "fit_live()")

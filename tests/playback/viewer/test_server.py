@@ -35,7 +35,7 @@ from morgs_mi.playback.viewer.access import refusal
 from morgs_mi.playback.viewer.images import RecordedImages
 from morgs_mi.playback.viewer.server import Viewer
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.studio.live.live_capture import write_images
+from morgs_mi.studio.live.fit_live import write_images
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.playback.viewer.serving import decoded, exact, get, raw, viewing
 from tests.scenes import noise_capture

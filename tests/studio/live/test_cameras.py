@@ -14,8 +14,7 @@ from threading import Timer
 import numpy as np
 import pytest
 
-from morgs_mi.studio.live.cameras import CameraFeed, _nearest, _simultaneous
-from morgs_mi.studio.live.feed import Shot
+from morgs_mi.studio.live.cameras import CameraFeed, Shot, _nearest, _simultaneous
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 

@@ -16,7 +16,7 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.studio.live.live_frames import live_frames
+from morgs_mi.studio.live.sources import live_frames
 from tests.scenes import captures as layouts
 
 NAMES = ("cam1", "cam2", "cam3")

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.studio.live import playing as module
+from morgs_mi.studio.live import sources as module
 from morgs_mi.studio.live.live_config import LiveConfig
-from morgs_mi.studio.live.playing import ClipClock, is_video, play
-from morgs_mi.studio.live.sources import open_feed
+from morgs_mi.studio.live.sources import ClipClock, is_video, open_feed, play
 
 
 def clip(path: Path, count: int, fps: float = 50) -> Path:

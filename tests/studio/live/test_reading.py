@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.studio.live import reading as module
-from morgs_mi.studio.live.reading import read_camera
+from morgs_mi.studio.live import sources as module
+from morgs_mi.studio.live.sources import read_camera
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 
