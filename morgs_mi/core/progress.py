@@ -14,6 +14,9 @@ from typing import Any
 Report = Callable[[str, float, float], None]
 """Function that is called with (stage, done, total)."""
 
+Steps = Callable[[int, int], None]
+"""Function that is called with (done, total)."""
+
 _PERIOD = 0.2  # seconds between two updates
 _WIDTH = 30
 

@@ -32,7 +32,7 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import MAX_TOML, read_text, read_toml
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
 from morgs_mi.io.unread import warn_unread
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
@@ -82,11 +82,8 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
         for key, table in tables.items()
         if isinstance(table, dict) and any(k in table for k in _KEYS)
     }
-    if not entries:
-        raise ValueError(
-            f"{path}: expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, "
-            "found none; export the calibration again."
-        )
+    requirement = f"expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}"
+    require(entries, str(path), requirement, "none", "export the calibration again")
     keys = (content.keys() | tables.keys()) - entries.keys() - {"cameras"}
     warn_unread(path, keys.union(*entries.values()) - _CAMERA - _HARMLESS)
     pairs = [_camera(path, key, entry) for key, entry in entries.items()]
@@ -96,31 +93,23 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
 def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Lens]:
     where = f"{path}, table [{key}]"
     name = entry.get("name", key if key.startswith("cam") else f"cam_{key}")
-    if not isinstance(name, str | int) or name == "":
-        raise ValueError(
-            f"{where}: `name` must be a text, got {shortened(name)}; name the camera as its clip."
-        )
+    is_text = isinstance(name, str | int) and name != ""
+    require(is_text, where, "`name` must be a text", shortened(name), "name the camera as its clip")
     width, height = _array(where, entry, "size", (2,)).tolist()
-    if not (width.is_integer() and height.is_integer()):
-        raise ValueError(
-            f"{where}: `size` must be whole pixels [w, h], got {entry['size']}; calibrate again."
-        )
+    is_whole = width.is_integer() and height.is_integer()
+    require(is_whole, where, "`size` must be whole pixels [w, h]", entry["size"], "calibrate again")
     K = _array(where, entry, "matrix", (3, 3)).copy()
     K[:2, 2] += 0.5
     rotation = _array(where, entry, "rotation", (3,), (3, 3))
     if rotation.shape == (3,):
         rotation = Rotation.from_rotvec(rotation).as_matrix()
     viewmat = rigid(where, np.column_stack([rotation, _array(where, entry, "translation", (3,))]))
-    try:
-        clip = _FOLDER.sub(r"\1", str(name))
-        camera = Camera(K, viewmat, int(width), int(height), clip)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
-    if entry.get("fisheye", False):
-        distortions = _array(where, entry, "distortions", (4,)).tolist()
-        return camera, Lens("OPENCV_FISHEYE", tuple(distortions))
-    distortions = _array(where, entry, "distortions", (4,), (5,), (8,)).tolist()
-    return camera, opencv_lens(distortions)
+    with errors_at(where):
+        camera = Camera(K, viewmat, int(width), int(height), _FOLDER.sub(r"\1", str(name)))
+    is_fisheye = entry.get("fisheye", False)
+    counts = [(4,)] if is_fisheye else [(4,), (5,), (8,)]
+    k = _array(where, entry, "distortions", *counts).tolist()
+    return camera, Lens("OPENCV_FISHEYE", tuple(k)) if is_fisheye else opencv_lens(k)
 
 
 def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -129,13 +118,14 @@ def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, .
         value = np.squeeze(np.array(entry.get(key), np.float64))
     except (TypeError, ValueError, OverflowError):
         value = np.zeros(0)
-    if value.shape not in shapes or not bounded(value):
-        expected = " or ".join(str([*shape]) for shape in shapes)
-        got = shortened(entry[key]) if key in entry else "none"
-        raise ValueError(
-            f"{where}: `{key}` must be finite numbers {expected} of at most {LARGEST:g}, got "
-            f"{got}; calibrate this camera, or remove its table and its clip."
-        )
+    expected = " or ".join(str([*shape]) for shape in shapes)
+    require(
+        value.shape in shapes and bounded(value),
+        where,
+        f"`{key}` must be finite numbers {expected} of at most {LARGEST:g}",
+        shortened(entry[key]) if key in entry else "none",
+        "calibrate this camera, or remove its table and its clip",
+    )
     return value
 
 

@@ -16,6 +16,7 @@ Positions are converted to metres.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -34,7 +35,7 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import check_claim, read_bytes
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
 from morgs_mi.io.unread import warn_unread
 
 _LOG = logging.getLogger(__name__)
@@ -45,35 +46,26 @@ _SUBPIXELS = 64
 _VALUE_BYTES = 200
 _METRES = 1e-3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-# Attributes of a camera's elements that are read, and others that QTM writes and that say nothing
-# about the images.
-_READ = {
-    "fov_video": {"left", "top", "right", "bottom"},
-    "transform": {*"xyz", *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))},
-    "intrinsic": {
-        "focalLengthU",
-        "focalLengthV",
-        "centerPointU",
-        "centerPointV",
-        "focallength",
-        "radialDistortion1",
-        "radialDistortion2",
-        "radialDistortion3",
-        "tangentalDistortion1",
-        "tangentalDistortion2",
-        "sensorMinU",
-        "sensorMaxU",
-        "sensorMinV",
-        "sensorMaxV",
-    },
-}
-_HARMLESS = {"fov_marker", "fov_marker_max", "fov_video_max"}
+# Attributes of a camera's elements that are read.
+_EDGES = ("left", "top", "right", "bottom")
+_AXES = [f"r{row}{column}" for row in "123" for column in "123"]
+_PINHOLE = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
 _DISTORTION = (
     "radialDistortion1",
     "radialDistortion2",
     "tangentalDistortion1",
     "tangentalDistortion2",
+    "radialDistortion3",
 )
+# Others that QTM writes and that say nothing about the images.
+_SENSOR = ("focallength", "sensorMinU", "sensorMaxU", "sensorMinV", "sensorMaxV")
+_HARMLESS = {"fov_marker", "fov_marker_max", "fov_video_max"}
+_READ = {
+    "fov_video": {*_EDGES},
+    "transform": {*"xyz", *_AXES},
+    "intrinsic": {*_PINHOLE, *_DISTORTION, *_SENSOR, "skew"},
+}
+_REMEDY = "export the calibration again"
 
 
 def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
@@ -94,11 +86,7 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
             f"{path}: expected XML, got a broken file ({error}); export it again."
         ) from None
     active = [element for element in root.iter("camera") if element.get("active", "1") != "0"]
-    if not active:
-        raise ValueError(
-            f"{path}: expected an element `camera` for each camera, found none; export the "
-            "calibration again."
-        )
+    require(active, str(path), "expected an element `camera` for each camera", "none", _REMEDY)
     if serials := [
         element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"
     ]:
@@ -111,16 +99,14 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
     unread: set[str] = set()
     for element in (element for camera in active for element in camera):
         if element.tag in _READ:
-            others = set(element.keys()) - _READ[element.tag]
-            # A `skew` of 0 changes nothing.
-            if not element.get("skew", "").strip("0."):
-                others.discard("skew")
-            unread |= others
+            unread |= set(element.keys()) - _READ[element.tag]
+            if element.get("skew", "").strip("0."):  # a skew of 0 changes nothing
+                unread.add("skew")
         elif element.tag not in _HARMLESS:
             unread.add(element.tag)
     warn_unread(path, unread)
-    pairs = [_camera(path, element) for element in active]
-    return [camera for camera, _ in pairs], [lens for _, lens in pairs]
+    cameras, lenses = zip(*(_camera(path, element) for element in active), strict=True)
+    return list(cameras), list(lenses)
 
 
 class _Plain(ElementTree.TreeBuilder):
@@ -135,57 +121,34 @@ class _Plain(ElementTree.TreeBuilder):
 def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
     serial = element.get("serial", "")
     where = f"{path}, camera {serial!r}"
-    if not serial:
-        raise ValueError(
-            f"{path}: every `camera` must have a `serial`, got one without; export the "
-            "calibration again."
-        )
-    left, top, right, bottom = _numbers(
-        where, element, "fov_video", "left", "top", "right", "bottom"
-    )
-    fu, fv, cu, cv = _numbers(
-        where, element, "intrinsic", "focalLengthU", "focalLengthV", "centerPointU", "centerPointV"
-    )
+    require(serial, str(path), "every `camera` must have a `serial`", "one without", _REMEDY)
+    left, top, right, bottom = _numbers(where, element, "fov_video", _EDGES)
+    fu, fv, cu, cv = _numbers(where, element, "intrinsic", _PINHOLE)
     K = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, _SUBPIXELS]]) / _SUBPIXELS
     K[:2, 2] -= left, top
-    axes = _numbers(
-        where,
-        element,
-        "transform",
-        *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)),
-    )
-    R = _OPENCV_FROM_OPENGL @ np.reshape(axes, (3, 3))
-    position = _METRES * np.array(_numbers(where, element, "transform", "x", "y", "z"))
+    R = _OPENCV_FROM_OPENGL @ np.reshape(_numbers(where, element, "transform", _AXES), (3, 3))
+    position = _METRES * np.array(_numbers(where, element, "transform", "xyz"))
     viewmat = rigid(where, np.column_stack([R, -R @ position]))
-    k1, k2, p1, p2 = _numbers(where, element, "intrinsic", *_DISTORTION)
-    (k3,) = _numbers(where, element, "intrinsic", "radialDistortion3")
-    try:
-        camera = Camera(K, viewmat, round(right - left + 1), round(bottom - top + 1), serial)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
-    return camera, opencv_lens((k1, k2, p1, p2, k3))
+    lens = opencv_lens(_numbers(where, element, "intrinsic", _DISTORTION))
+    with errors_at(where):
+        size = round(right - left + 1), round(bottom - top + 1)
+        return Camera(K, viewmat, *size, serial), lens
 
 
-def _numbers(where: str, camera: Element, name: str, *keys: str) -> list[float]:
+def _numbers(where: str, camera: Element, name: str, keys: Sequence[str]) -> list[float]:
     """Return attributes of a camera's element `name`."""
     element = camera.find(name)
     if element is None:
-        raise ValueError(
-            f"{where}: expected an element `{name}`, found none; export the calibration again."
-        )
+        raise ValueError(f"{where}: expected an element `{name}`, found none; {_REMEDY}.")
     numbers = []
     for key in keys:
-        text = element.get(key)
+        text = element.get(key, "none")
         try:
-            numbers.append(float(text or "nan"))
+            numbers.append(float(text))
         except ValueError:
             numbers.append(np.nan)
-        if not bounded(numbers[-1]):
-            got = "none" if text is None else repr(text)
-            raise ValueError(
-                f"{where}: `{key}` of `{name}` must be a finite number of at most {LARGEST:g}, "
-                f"got {got}; calibrate in QTM and export again."
-            )
+        requirement = f"`{key}` of `{name}` must be a finite number of at most {LARGEST:g}"
+        require(bounded(numbers[-1]), where, requirement, text, "calibrate in QTM and export again")
     return numbers
 
 

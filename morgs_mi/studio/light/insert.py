@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +25,7 @@ from annotated_types import Ge
 
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.core.checks import LARGEST, bounded, few, require
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.gaussians import Gaussians
@@ -35,7 +36,7 @@ from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.studio.light.light_probe import CLIPPED, light_probe
 from morgs_mi.studio.light.shadows import shadow_ratio, shadowed
-from morgs_mi.studio.synth.scene import failures_in, module_of
+from morgs_mi.studio.synth.scene import build_of, failures_in
 from morgs_mi.surfaces.surface_view import lights, rays_for, traced
 
 LAYERS = ("splats", "surfaces", "shadow")
@@ -45,6 +46,8 @@ alpha, and the shadow of the surfaces on the splats, a factor of their linear li
 Light = Literal["probe", "traced"]
 
 Build = Callable[[int, float], dict[str, Any]]
+
+_PLACE = "The inserted scene"  # where its errors begin
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class InsertConfig:
     shadows: bool = True
     """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
     light: Light = "probe"
-    """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces
+    """``probe`` lights the surfaces by an environment map, see `light_probe`; ``traced`` traces
     rays through the Gaussians (`splat_path`), which also throw shadows on them."""
     clipped: float | None = None
     """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a
@@ -74,27 +77,22 @@ def load_insert(path: str | Path) -> Build:
             the file, and the line of a Python file.
     """
     path = Path(path)
-    if path.suffix not in (".xml", ".py") or not path.is_file():
-        kind = f"{path.suffix!r}" if path.is_file() else "none"
-        raise ValueError(
-            f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path."
-        )
+    require(
+        path.suffix in (".xml", ".py") and path.is_file(),
+        str(path),
+        "expected a scene to insert, FILE.xml or FILE.py",
+        repr(path.suffix) if path.is_file() else "none",
+        "check the path",
+    )
     if path.suffix == ".xml":
-        try:
+        with _mitsuba_errors_at(str(path)):
             scene: Any = mi.load_file(str(path))
-        except RuntimeError as error:
-            raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
         entries = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
         # Mitsuba adds an integrator to files without one.
         if ElementTree.parse(path).find("integrator") is not None:
             entries["integrator"] = scene.integrator()
         return lambda frame, time: entries
-    build = getattr(module_of(path, "insert"), "build", None)
-    if not callable(build):
-        raise ValueError(
-            f"{path}: expected a function `build(frame, time)` that returns the entries of a "
-            "Mitsuba scene, found none; add it."
-        )
+    build = build_of(path, "build(frame, time) -> dict")
 
     def build_entries(frame: int, time: float) -> dict[str, Any]:
         with failures_in(path):
@@ -130,11 +128,8 @@ def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     """
     numbers = frame_numbers(stream)
     missing_frames = sorted(set(frames) - set(numbers))
-    if missing_frames:
-        raise ValueError(
-            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got "
-            f"{missing_frames[0]}; choose others."
-        )
+    requirement = f"the frames must be out of {numbers[0]} to {numbers[-1]}"
+    require(not missing_frames, str(stream.path), requirement, few(missing_frames), "choose others")
     return sorted(set(frames))
 
 
@@ -148,7 +143,8 @@ def render_inserted(
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render frames of a stream for one camera with a Mitsuba scene inserted.
 
-    An inserted scene without emitters is lit by the Gaussians, see `captured_light`.
+    An inserted scene without emitters is lit by the Gaussians. A capture rarely shows what is
+    behind the cameras; there, the light has the mean colour of the view.
 
     Args:
         stream: the file.
@@ -182,47 +178,9 @@ def render_inserted(
             yield frame, images
 
 
-def captured_light(
-    gaussians: Gaussians, camera: Camera, position: np.ndarray, clipped: float = CLIPPED
-) -> dict[str, Any]:
-    """Return the `light_probe` at a point, where directions without Gaussians have the mean colour
-    of a view.
-
-    A capture rarely shows what is behind the cameras; black there would take half of the light
-    away.
-    """
-    return light_probe(
-        gaussians, position, background=_mean_color(gaussians, camera, clipped), clipped=clipped
-    )
-
-
 def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[float]:
-    white = np.inf if clipped == 1 else 1.0
-    return (
-        np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, white)
-        .mean((0, 1))
-        .tolist()
-    )
-
-
-def _integrator(entry: Any, light: Light, clipped: float) -> Any:
-    """Return the integrator of the surfaces: the one of the inserted scene, if it has one.
-
-    Raises:
-        ValueError: it does not light them as the option demands.
-    """
-    entry = entry or (
-        {"type": "splat_path", "clipped": clipped} if light == "traced" else {"type": "path"}
-    )
-    nested = mi.load_dict(entry) if isinstance(entry, dict) else entry
-    if hasattr(nested, "splats") != (light == "traced"):
-        name = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
-        raise ValueError(
-            f"The inserted scene: with light {light!r}, expected "
-            f"{'an' if light == 'traced' else 'no'} integrator `splat_path`, got {name}; remove "
-            "`integrator` from the scene, or choose the other light."
-        )
-    return nested
+    image = np.asarray(rasterize(gaussians, camera, ("color",)).color)
+    return np.clip(image, 0, np.inf if clipped == 1 else 1.0).mean((0, 1)).tolist()
 
 
 def _render(
@@ -233,10 +191,21 @@ def _render(
     config: InsertConfig,
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
-    clipped = CLIPPED if config.clipped is None else config.clipped
-    nested = _integrator(entries.pop("integrator", None), config.light, clipped)
+    clipped: Any = config.clipped
+    is_traced = config.light == "traced"
+    usual = {"type": "splat_path", "clipped": clipped} if is_traced else {"type": "path"}
+    entry = entries.pop("integrator", None) or usual
+    nested: Any = mi.load_dict(entry) if isinstance(entry, dict) else entry
+    article = "an" if is_traced else "no"
+    require(
+        hasattr(nested, "splats") == is_traced,
+        _PLACE,
+        f"with light {config.light!r}, expected {article} integrator `splat_path`",
+        type(nested).__name__ if hasattr(nested, "splats") else nested.class_name(),
+        "remove `integrator` from the scene, or choose the other light",
+    )
     ratio = np.ones(len(gaussians), np.float32)
-    try:
+    with _mitsuba_errors_at(_PLACE):
         surfaces, lit_scene = _lit_scenes(entries, gaussians, camera, config.light, clipped)
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit_scene, camera.position)
@@ -246,8 +215,6 @@ def _render(
             sensor = _sensor(camera)
             with traced(nested, rays_for(nested, dark), srgb=True):
                 images["surfaces"] = np.asarray(nested.render(surfaces, sensor, spp=config.samples))
-    except RuntimeError as error:
-        raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
         image = rasterize(gaussians, camera)
         bright = decode_light(np.asarray(image.color))
@@ -267,23 +234,26 @@ def _lit_scenes(
         ValueError: it has no shapes, or they are not finite.
     """
     scene: Any = mi.load_dict({"type": "scene", **entries})
-    if not (scene.shapes() or scene.emitters()):
-        raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+    parts = scene.shapes() or scene.emitters()
+    require(parts, _PLACE, "expected at least one shape", "none", "add one")
     box = scene.bbox()
-    if scene.shapes() and not bounded(np.array([box.min, box.max])):
-        raise ValueError(
-            f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} "
-            f"to {box.max}; correct their places and sizes."
-        )
+    require(
+        not scene.shapes() or bounded(np.array([box.min, box.max])),
+        _PLACE,
+        f"expected shapes within {LARGEST:g} world units",
+        f"{box.min} to {box.max}",
+        "correct their places and sizes",
+    )
     if scene.emitters():
         return scene, scene
+    color = _mean_color(gaussians, camera, clipped)
     center = np.array(box.center()).ravel()
-    lamp = captured_light(gaussians, camera, center, clipped)
+    lamp = light_probe(gaussians, center, background=color, clipped=clipped)
     lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
     if light == "probe":
         return lit_scene, lit_scene
     # The surfaces get the light of the Gaussians by rays, and here what comes from behind them.
-    radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
+    radiance = decode_light(np.array(color)).tolist()
     lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp}), lit_scene
 
@@ -322,9 +292,14 @@ def _sensor(camera: Camera) -> Any:
     return mi.load_dict(camera.sensor(pixel_format="rgba"))
 
 
-def _reason(error: RuntimeError) -> str:
-    """Return Mitsuba's reason in one line, without the places in its own source."""
-    return re.sub(r"\[\w+\.\w+:\d+\] ", "", " ".join(str(error).split())).rstrip(".")
+@contextmanager
+def _mitsuba_errors_at(place: str) -> Iterator[None]:
+    """Raise `ValueError` with Mitsuba's reason in one line, without the places in its source."""
+    try:
+        yield
+    except RuntimeError as error:
+        reason = re.sub(r"\[\w+\.\w+:\d+\] ", "", " ".join(str(error).split())).rstrip(".")
+        raise ValueError(f"{place}: {reason}; correct the scene.") from error
 
 
 def _parts(scene: Any) -> list[Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import cv2
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number, numbers
+from morgs_mi.core.checks import check_number, numbers, require
 from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
@@ -28,15 +29,6 @@ from morgs_mi.render.rasterize import rasterize
 CLIPPED = 4.0
 """Radiance of colours that the video clipped at 1: a guess of two stops above white."""
 
-# Direction and up of the faces of the cube.
-_FACES = [
-    ((1, 0, 0), (0, 1, 0)),
-    ((-1, 0, 0), (0, 1, 0)),
-    ((0, 1, 0), (0, 0, 1)),
-    ((0, -1, 0), (0, 0, 1)),
-    ((0, 0, 1), (0, 1, 0)),
-    ((0, 0, -1), (0, 1, 0)),
-]
 # Pixels beyond each edge of a face, for interpolation.
 _MARGIN = 2
 # Display-referred value above which a colour counts as clipped in part; at 1 it does entirely.
@@ -80,22 +72,22 @@ def light_probe(
     place = "light_probe()"
     check_number(place, "height", height, "[4, 8192]")
     check_number(place, "clipped", clipped, "[1, inf)")
-    center = numbers(place, "position", position).astype(np.float64)
-    check_point(place, "position", center, "x, y and z")
+    center = check_point(place, "position", position)
     directions = _directions(int(height))
     axis = np.abs(directions).argmax(-1)
     largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
-    face_of = 2 * axis + (largest < 0)  # index in `_FACES`
     # A face has as many pixels per degree as the map.
     size = max(int(height) // 2, 4)
     width = size + 2 * _MARGIN
     fov = np.rad2deg(2 * np.arctan(width / size))
     color = np.zeros((*directions.shape[:2], 3), np.float32)
-    for k, (forward, up) in enumerate(_FACES):
+    for k, sign in product(range(3), (1, -1)):
+        forward = sign * np.eye(3)[k]
+        up = np.eye(3)[2 if k == 1 else 1]
         camera = Camera.look_at(center, center + forward, up, fov, width, width)
         camera = replace(camera, near=near)
         image = np.asarray(rasterize(gaussians, camera, ("color",), background).color)
-        on_face = (face_of == k)[..., None]
+        on_face = ((axis == k) & (sign * largest > 0))[..., None]
         # What other faces show may be behind this camera.
         seen_directions = np.where(on_face, directions, np.asarray(camera.viewmat)[2, :3])
         pixels, _ = camera.project(camera.position + seen_directions)
@@ -105,12 +97,13 @@ def light_probe(
     return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light).T.reshape(directions.shape))}
 
 
-def check_point(place: str, name: str, point: np.ndarray, instead: str) -> None:
-    """Raise `ValueError` unless an argument is a finite point [3]; `instead` is what to pass."""
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(
-            f"{place}: `{name}` must be [3] and finite, got {point.tolist()}; pass {instead}."
-        )
+def check_point(place: str, name: str, point: ArrayLike) -> np.ndarray:
+    """Return an argument as a finite point [3]; anything else raises `ValueError`."""
+    point = numbers(place, name, point).astype(np.float64)
+    is_point = point.shape == (3,) and np.isfinite(point).all()
+    requirement = f"`{name}` must be [3] and finite"
+    require(is_point, place, requirement, point.tolist(), "pass x, y and z")
+    return point
 
 
 def _directions(height: int) -> np.ndarray:

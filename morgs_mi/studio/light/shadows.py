@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from morgs_mi.core.checks import check_number, check_type, numbers
+from morgs_mi.core.checks import check_number, check_type, numbers, require
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
@@ -57,15 +57,11 @@ def shadow_ratio(
     place = "shadow_ratio()"
     check_type(place, "gaussians", gaussians, Gaussians)
     check_number(place, "samples", samples, "[1, 65536]")
-    eye = numbers(place, "viewpoint", viewpoint)
-    check_point(place, "viewpoint", eye, "a camera's position")
+    eye = check_point(place, "viewpoint", viewpoint)
     emitters = scene.emitters()
     shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
-    if not emitters:
-        raise ValueError(
-            f"{place}: expected a scene with an emitter, got none; add one, such as an `envmap` of "
-            "morgs_mi.light_probe()."
-        )
+    remedy = "add one, such as an `envmap` of morgs_mi.light_probe()"
+    require(emitters, place, "expected a scene with an emitter", "none", remedy)
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():
@@ -91,11 +87,13 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
         ValueError: a ratio of another shape, or with numbers that are negative or not finite.
     """
     ratio = numbers("shadowed()", "ratio", ratio).astype(np.float64)
-    if ratio.shape != (len(gaussians),) or not (np.isfinite(ratio) & (ratio >= 0)).all():
-        raise ValueError(
-            f"shadowed(): `ratio` must be [N] with N={len(gaussians)}, finite and not negative, "
-            f"got {list(ratio.shape)}; pass the result of shadow_ratio()."
-        )
+    require(
+        ratio.shape == (len(gaussians),) and (np.isfinite(ratio) & (ratio >= 0)).all(),
+        "shadowed()",
+        f"`ratio` must be [N] with N={len(gaussians)}, finite and not negative",
+        list(ratio.shape),
+        "pass the result of shadow_ratio()",
+    )
     # The mean colours [N, 1, 3].
     mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)
     factor = encode_light(ratio[:, None, None] * decode_light(mean)) / mean
@@ -110,44 +108,32 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
 
 class _Receivers:
     """Centres and orientation of the Gaussians: `flat` is 0 in a round neighbourhood and 1 on a
-    plane.
+    plane. Single Gaussians of a fitted surface lie in it, but are not all flat.
     """
 
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
         means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
-        normals, flat = _orientation(gaussians, means)
+        mixture = _mixture(means, np.array(dr.detach(gaussians.opacities), np.float64))
+        # The covariance of the mixture: the mean of its second moments, minus the second moment of
+        # its centre.
+        centered = means - means.mean(0)
+        centers = mixture @ centered
+        moments = covariances(gaussians) + centered[:, :, None] * centered[:, None]
+        mean_moments = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3)
+        variances, directions = np.linalg.eigh(
+            mean_moments - centers[:, :, None] * centers[:, None]
+        )
+        normals = directions[:, :, 0]  # the thinnest direction
         is_back = np.sum(normals * (eye - means), axis=1) < 0
         normals = np.where(is_back[:, None], -normals, normals)
-        self.centers = mi.Point3f(_columns(means))
-        self.normals = mi.Vector3f(_columns(normals))
+        self.centers = dr.unravel(mi.Point3f, from_numpy(mi.Float, means))
+        self.normals = dr.unravel(mi.Vector3f, from_numpy(mi.Float, normals))
+        flat = 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
         self.flat = from_numpy(mi.Float, flat)
 
     def response(self, direction: Any) -> Float:
         """Return the received fraction of light from a direction."""
         return dr.lerp(0.5, dr.maximum(dr.dot(self.normals, direction), 0), self.flat)
-
-
-def _columns(rows: np.ndarray) -> list[Float]:
-    """Return the three columns of an array [N, 3]."""
-    return [from_numpy(mi.Float, rows[:, k]) for k in range(3)]
-
-
-def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the thinnest direction [N, 3] of the Gaussians around each one, and how flat they are
-    together, [N].
-
-    Single Gaussians of a fitted surface lie in it, but are not all flat.
-    """
-    mixture = _mixture(means, np.array(dr.detach(gaussians.opacities), np.float64))
-    # The covariance of the mixture: the mean of its second moments, minus the second moment of its
-    # centre.
-    centered = means - means.mean(0)
-    centers = mixture @ centered
-    moments = covariances(gaussians) + centered[:, :, None] * centered[:, None]
-    mean_moments = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3)
-    covariance = mean_moments - centers[:, :, None] * centers[:, None]
-    variances, directions = np.linalg.eigh(covariance)
-    return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
 
 
 def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:

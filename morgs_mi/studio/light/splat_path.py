@@ -19,6 +19,7 @@ Mitsuba has a base class for every variant, so this module is imported again aft
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import drjit as dr
@@ -26,8 +27,9 @@ import mitsuba as mi
 from annotated_types import Ge
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
 
+from morgs_mi.core.checks import require
 from morgs_mi.core.config import check_value
-from morgs_mi.core.types import Bool, Float, Jit
+from morgs_mi.core.types import Bool, Float
 from morgs_mi.studio.light.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
 
@@ -36,6 +38,21 @@ _PROPERTIES = {
     "rr_depth": Annotated[int, Ge(1)],
     "clipped": Annotated[float, Ge(1)],
 }
+
+
+@dataclass
+class _Path:
+    """Paths after some segments, the state of the loop."""
+
+    ray: Any  # next segment
+    depth: Any  # number of segments that ended on a surface
+    L: Any  # radiance so far; in the second pass, what is left of it
+    δL: Any  # its derivative
+    β: Any  # throughput
+    η: Any  # ratio of the indices of refraction
+    si: Any  # surface that the next segment leaves
+    pdf: Any  # density of its direction there
+    is_delta: Any  # whether the direction had no choice
 
 
 class SplatPathIntegrator(RBIntegrator):
@@ -69,12 +86,13 @@ class SplatPathIntegrator(RBIntegrator):
             if name in props:
                 check_value("splat_path", name, props[name], kind)
         super().__init__(props)
-        if not mi.is_rgb:
-            raise ValueError(
-                f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; "
-                "call mi.set_variant() before the scene is loaded, because Gaussians have RGB "
-                "colours."
-            )
+        require(
+            mi.is_rgb,
+            "splat_path",
+            "expected a variant such as 'llvm_ad_rgb'",
+            repr(mi.variant()),
+            "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours",
+        )
         self.clipped = float(props.get("clipped", CLIPPED))
         self.splats: SplatRays | None = None
         self.srgb = True
@@ -91,28 +109,18 @@ class SplatPathIntegrator(RBIntegrator):
         **_: Any,
     ) -> tuple[Any, Bool, list[Float], Any]:
         """Return radiance or its derivative, as `ADIntegrator.sample` does."""
-        if self.splats is None:
-            raise ValueError(
-                "splat_path: expected Gaussians, got none; set it as the `surfaces` of a "
-                "`gaussian_splat`, which passes its own."
-            )
+        remedy = "set it as the `surfaces` of a `gaussian_splat`, which passes its own"
+        require(self.splats, "splat_path", "expected Gaussians", "none", remedy)
         primal = mode == dr.ADMode.Primal
         ctx = mi.BSDFContext()
         sign = 1 if primal else -1
 
-        def bounce(
-            active: Bool,
-            sampler: Any,
-            ray: Any,
-            depth: Any,
-            L: Any,
-            δL: Any,
-            β: Any,
-            η: Float,
-            last_si: Any,
-            last_pdf: Float,
-            last_delta: Bool,
-        ) -> tuple[Jit, ...]:
+        def bounce(active: Bool, sampler: Any, path: _Path) -> tuple[Bool, Any, _Path]:
+            ray = path.ray
+            depth = path.depth
+            L = path.L
+            δL = path.δL
+            β = path.β
             si = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
             bsdf = si.bsdf(ray)
 
@@ -126,8 +134,8 @@ class SplatPathIntegrator(RBIntegrator):
             # ------------------------- Direct emission --------------------------
 
             visible = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
-            ds = mi.DirectionSample3f(scene, si, last_si)
-            mis = mis_weight(last_pdf, scene.pdf_emitter_direction(last_si, ds, ~last_delta))
+            ds = mi.DirectionSample3f(scene, si, path.si)
+            mis = mis_weight(path.pdf, scene.pdf_emitter_direction(path.si, ds, ~path.is_delta))
             with dr.resume_grad(when=not primal):
                 Le = β * mis * ds.emitter.eval(si, visible)
 
@@ -167,7 +175,7 @@ class SplatPathIntegrator(RBIntegrator):
                         else:
                             δL = δL + dr.forward_to(Lo)
             β = β * scale
-            η = η * direction_sample.eta
+            η = path.η * direction_sample.eta
             onwards = si.spawn_ray(si.to_world(direction_sample.wo))
 
             # ------------------------ Stopping criterion ------------------------
@@ -177,25 +185,13 @@ class SplatPathIntegrator(RBIntegrator):
             roulette = depth >= self.rr_depth
             proceed &= (largest > 0) & (~roulette | (sampler.next_1d(proceed) < survival))
             β = dr.select(roulette, β * dr.rcp(survival), β)
-            delta = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
+            is_delta: Any = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
             depth = dr.select(si.is_valid(), depth + 1, depth)
-            return (
-                proceed,
-                sampler,
-                onwards,
-                depth,
-                L,
-                δL,
-                β,
-                η,
-                dr.detach(si),
-                direction_sample.pdf,
-                delta,
-            )
+            last_si = dr.detach(si)
+            end = _Path(onwards, depth, L, δL, β, η, last_si, direction_sample.pdf, is_delta)
+            return proceed, sampler, end
 
-        state = (
-            mi.Bool(active),
-            sampler,
+        start = _Path(
             mi.Ray3f(dr.detach(ray)),
             mi.UInt32(0),
             mi.Spectrum(0 if primal else state_in),
@@ -206,11 +202,10 @@ class SplatPathIntegrator(RBIntegrator):
             mi.Float(1),
             mi.Bool(True),
         )
-        end = dr.while_loop(
-            state, lambda active, *_: active, bounce, label=f"splat_path ({mode.name})"
-        )
-        depth, L, δL = end[3:6]
-        return L if primal else δL, depth != 0, [], L
+        state = (mi.Bool(active), sampler, start)
+        label = f"splat_path ({mode.name})"
+        end = dr.while_loop(state, lambda active, *_: active, bounce, label=label)[2]
+        return end.L if primal else end.δL, end.depth != 0, [], end.L
 
     def _layer(self, ray: Any, active: Bool) -> tuple[Any, Float]:
         """Return the radiance that the Gaussians on a segment emit, and their transmittance."""

@@ -25,6 +25,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import write_json
 
+_FILE = "disturbances.json"
+
 
 @dataclass(frozen=True)
 class Disturbances:
@@ -76,18 +78,14 @@ def draw_disturbances(
     """
     check_ranges(disturbances, "draw_disturbances()")
     d = disturbances
-    offset = d.time_offset * _uniform(seed, 0, num_cameras)
-    offset[0] = 0
-    k = d.distortion * _uniform(seed, 4, num_cameras) + 0.0  # not -0
-    return tuple(
-        CameraDisturbance(float(offset[c]), float(d.rolling_shutter), float(k[c]))
-        for c in range(num_cameras)
+    offsets, ks = (
+        # Not -0.
+        (largest * np.random.default_rng([seed, 3, kind]).uniform(-1, 1, num_cameras) + 0.0)
+        for kind, largest in ((0, d.time_offset), (4, d.distortion))
     )
-
-
-def _uniform(seed: int, kind: int, num_cameras: int) -> np.ndarray:
-    """Return a number from -1 to 1 for each camera, for one kind of disturbances."""
-    return np.random.default_rng([seed, 3, kind]).uniform(-1, 1, num_cameras)
+    offsets[0] = 0
+    pairs = zip(offsets.tolist(), ks.tolist(), strict=True)
+    return tuple(CameraDisturbance(offset, float(d.rolling_shutter), k) for offset, k in pairs)
 
 
 def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:
@@ -103,13 +101,13 @@ def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.nda
     )[:, 0]
 
 
-def save_disturbances(folder: str | Path, cameras: Mapping[str, CameraDisturbance]) -> None:
+def save_disturbances(folder: Path, cameras: Mapping[str, CameraDisturbance]) -> None:
     """Write the disturbance of each camera, by name, into a capture's ``truth`` folder.
 
     Raises:
         OSError: the file cannot be written.
     """
-    write_json(_path(folder), {name: asdict(camera) for name, camera in cameras.items()})
+    write_json(folder / _FILE, {name: asdict(camera) for name, camera in cameras.items()})
 
 
 def load_disturbances(folder: str | Path) -> dict[str, CameraDisturbance]:
@@ -119,21 +117,11 @@ def load_disturbances(folder: str | Path) -> dict[str, CameraDisturbance]:
         FileNotFoundError: the folder has no such file.
         ValueError: the file is broken.
     """
-    path = _path(folder)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"load_disturbances(): there is no file {path}; pass the truth folder of a synthetic "
-            "capture."
-        )
+    path = Path(folder) / _FILE
     content = read_json(path)
     try:
         return {name: CameraDisturbance(**entry) for name, entry in content.items()}
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, TypeError) as error:
         raise ValueError(
-            f"{path}: expected the disturbances of each camera, got a broken file ({error}); "
-            "synthesise the capture again."
+            f"{path}: expected the disturbances of each camera, got a broken file ({error})."
         ) from None
-
-
-def _path(folder: str | Path) -> Path:
-    return Path(folder) / "disturbances.json"

@@ -11,6 +11,7 @@ import numpy as np
 
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.studio.synth.disturbances import undistorted
 from morgs_mi.studio.synth.ground_truth import SurfacePoints
@@ -97,11 +98,10 @@ class PathTracer:
         for name, light in scene.lights.items():
             if light.pose is not None:
                 key = f"{name}.to_world"
-                if key not in self._params:
-                    raise ValueError(
-                        f"scene {scene.name!r}, light {name!r}: a lamp with a pose must be a shape "
-                        "with an emitter, e.g. a rectangle; use one, or leave out the pose."
-                    )
+                where = f"scene {scene.name!r}, light {name!r}"
+                requirement = "a lamp with a pose must be a shape with an emitter, e.g. a rectangle"
+                remedy = "use one, or leave out the pose"
+                require(key in self._params, where, requirement, light.shape["type"], remedy)
                 transform = np.array(self._params[key].matrix, float).reshape(4, 4)
                 self._lamps[key] = (light.pose, transform)
         self._exposure = 1.0

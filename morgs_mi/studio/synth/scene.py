@@ -8,7 +8,6 @@ world units.
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,13 +15,13 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from traceback import extract_tb
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.checks import check_type, require
 from morgs_mi.core.documentation import page
 
 Pose = Callable[[float], np.ndarray]
@@ -119,36 +118,22 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
     if path is None or not path.is_file():
         raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path "
-            "of a .py file."
+            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)}, or a .py file."
         )
-    build = getattr(module_of(path, "scene"), "build", None)
-    if not callable(build):
-        raise ValueError(
-            f"load_scene(): {path} must define `build(seed) -> Scene`; add that function."
-        )
-    signature = inspect.signature(build)
-    try:
-        signature.bind(seed)
-    except TypeError:
-        raise ValueError(
-            f"load_scene(): `build` in {path} must take the seed alone, `build(seed) -> Scene`, "
-            f"got `build{signature}`; give further parameters a default."
-        ) from None
+    build = build_of(path, "build(seed) -> Scene")
     with failures_in(path):
         result = build(seed)
-    if not isinstance(result, Scene):
-        value_text = "None" if result is None else f"a {type(result).__name__}"
-        raise ValueError(
-            f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return "
-            "Scene(...)."
-        )
+    check_type("load_scene()", f"build(seed) of {path}", result, Scene, "return Scene(...)")
     return result
 
 
-def module_of(path: Path, kind: str) -> ModuleType:
-    """Return the module of a Python file, after running it; its name begins with its kind."""
-    spec = importlib.util.spec_from_file_location(f"morgs_mi_{kind}_{path.stem}", path)
+def build_of(path: Path, expected: str) -> Callable[..., Any]:
+    """Return the function `build` of a Python file, after running it.
+
+    Raises:
+        ValueError: it has none with the signature `expected`, or it fails.
+    """
+    spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
@@ -156,7 +141,9 @@ def module_of(path: Path, kind: str) -> ModuleType:
     sys.modules[spec.name] = module
     with failures_in(path):
         spec.loader.exec_module(module)
-    return module
+    build: Any = getattr(module, "build", None)
+    require(callable(build), str(path), f"it must define `{expected}`", "none", "add that function")
+    return build
 
 
 @contextmanager
@@ -183,11 +170,10 @@ def failures_in(path: Path) -> Iterator[None]:
 
 
 def check_scene(scene: Scene, times: Sequence[float]) -> None:
-    """Check the contents of a scene, and its poses at `times` in seconds.
+    """Check what Mitsuba would not refuse in a scene, and its poses at `times` in seconds.
 
     Raises:
         ValueError: an object, a lamp or a pose is not as described, or a name is used twice.
-        FileNotFoundError: the file of a mesh or a texture does not exist.
     """
     names: set[str] = set()
     for kind, expected, items in (
@@ -196,70 +182,39 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
     ):
         for name, item in items.items():
             where = f"scene {scene.name!r}, {kind} {name!r}"
-            if not isinstance(item, expected):
-                raise ValueError(
-                    f"{where}: expected {expected.__name__}(...), got a value of type "
-                    f"{type(item).__name__}; see {page('scenes')}."
-                )
+            check_type(where, "it", item, expected, f"see {page('scenes')}")
             # The names in Mitsuba.
             if isinstance(item, Light):
                 ids = [name]
-            elif item.pose is None:
+                _check_values(where, {"shape": item.shape})
+            else:
                 ids = [f"{name}_{part}" for part in item.shapes]
-            else:
-                ids = [name, f"{name}_group"]
-            for identifier in ids:
-                if identifier in names:
-                    raise ValueError(
-                        f"{where}: the name {identifier!r} is used twice; rename one of the two."
-                    )
+                if item.pose is not None:
+                    ids = [name, f"{name}_group"]
+                _check_values(where, item.shapes)
+            twice = names & {*ids}
+            requirement = "its names in Mitsuba must be its own"
+            require(not twice, where, requirement, f"{sorted(twice)} twice", "rename one")
             names.update(ids)
-            if isinstance(item, Light):
-                _check_node(where, item.shape)
-            else:
-                for part, shape in item.shapes.items():
-                    _check_node(f"{where}, shape {part!r}", shape)
-            if item.pose is not None:
-                for time in times:
-                    _check_pose(where, item.pose, time)
+            for time in times if item.pose is not None else ():
+                _check_pose(where, item.pose, time)
 
 
-def _check_node(where: str, node: Any) -> None:
-    """Check a Mitsuba dictionary, because Mitsuba's errors do not name the object or end the
-    process.
-    """
-    if not isinstance(node, Mapping) or "type" not in node:
-        expected = "expected a Mitsuba dictionary with a `type`"
-        raise ValueError(f"{where}: {expected}, got {node!r:.60}; see {page('scenes')}.")
+def _check_values(where: str, node: Mapping[str, Any]) -> None:
+    """Raise `ValueError` if a Mitsuba dictionary contains None, which would end the process."""
     for key, value in node.items():
-        if value is None:
-            raise ValueError(f"{where}: `{key}` must have a value, got None; leave it out.")
-        if key == "filename" and not Path(value).is_file():
-            raise FileNotFoundError(
-                f"{where}: its file {value} does not exist; for a file beside the scene, write "
-                f"str(Path(__file__).parent / {Path(value).name!r})."
-            )
-        if key == "filename" and not isinstance(value, str):
-            raise ValueError(
-                f"{where}: `filename` must be text, got a {type(value).__name__}; wrap it in str()."
-            )
+        require(value is not None, where, f"`{key}` must have a value", "None", "leave it out")
         if isinstance(value, Mapping):
-            _check_node(f"{where}, {key}", value)
+            _check_values(f"{where}, {key}", value)
 
 
-def _check_pose(where: str, pose: Pose, time: float) -> None:
+def _check_pose(where: str, pose: Any, time: float) -> None:
     where = f"{where}: its pose at {time:.4g} s"
     try:
-        matrix = np.asarray(pose(time), np.float64)
+        matrix = np.reshape(pose(time), (4, 4))
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".rstrip(".")
         raise ValueError(f"{where} fails with {reason}; correct the function.") from error
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        value = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
-        raise ValueError(
-            f"{where} must be a finite matrix [4, 4], got {value}; multiply translate() and "
-            "rotate()."
-        )
     rigid(f"{where} is not rigid", matrix)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from morgs_mi.studio.synth.scene import rotate, translate
@@ -22,7 +23,7 @@ def box(center: Sequence[float], half: Sequence[float], material: Material) -> d
     """Return a box with half-widths `half` along the axes."""
     return {
         "type": "cube",
-        "to_world": _transform(translate(*center) @ np.diag([*half, 1])),
+        "to_world": mi.ScalarTransform4f(translate(*center) @ np.diag([*half, 1])),
         "bsdf": material,
     }
 
@@ -43,10 +44,4 @@ def rod(
 def disk(center: Sequence[float], radius: float, material: Material) -> dict[str, Any]:
     """Return a disk that faces up."""
     facing_up = translate(*center) @ rotate("x", -np.pi / 2) @ np.diag([radius, radius, 1, 1])
-    return {"type": "disk", "to_world": _transform(facing_up), "bsdf": material}
-
-
-def _transform(matrix: np.ndarray) -> Any:
-    import mitsuba as mi
-
-    return mi.ScalarTransform4f(matrix)
+    return {"type": "disk", "to_world": mi.ScalarTransform4f(facing_up), "bsdf": material}

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
-from morgs_mi.core.config import check_ranges
 from morgs_mi.core.documentation import documented
 from morgs_mi.studio.synth.disturbances import Disturbances
 
@@ -45,14 +44,6 @@ class SynthConfig:
     """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the
     scene random.
     """
-
-    def check(self) -> None:
-        """Raise an error unless all settings are in range.
-
-        Raises:
-            ValueError: they are not.
-        """
-        check_ranges(self, "synthesize()")
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings, with the scene's own values for missing ones."""

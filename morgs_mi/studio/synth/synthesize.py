@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -24,9 +24,12 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
+from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.memory import check_memory
+from morgs_mi.core.progress import Steps
 from morgs_mi.io.listing import is_added
 from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import PLAYABLE, write_video
@@ -36,13 +39,11 @@ from morgs_mi.studio.synth.disturbances import (
     save_disturbances,
 )
 from morgs_mi.studio.synth.ground_truth import (
-    SurfacePoints,
     compute_ground_truth,
     move_with_objects,
 )
 from morgs_mi.studio.synth.path_tracer import PathTracer, developed
 from morgs_mi.studio.synth.scene import Scene, check_scene, load_scene
-from morgs_mi.studio.synth.sensor import check_lenses, mixed_seed, record_light
 from morgs_mi.studio.synth.synth_config import SynthConfig
 
 _LOG = logging.getLogger(__name__)
@@ -50,6 +51,9 @@ _LOG = logging.getLogger(__name__)
 _PIXEL_BYTES = 100
 _NUM_SFM_POINTS = 8000
 _NUM_TRACKS = 2000
+# Rows that a rolling shutter reads at one time; at 10 pixels per frame, objects move by 0.2 pixels
+# in this time.
+_BAND = 4
 
 
 def synthesize(
@@ -58,7 +62,7 @@ def synthesize(
     config: SynthConfig | None = None,
     *,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
 ) -> Path:
     """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground
     truth.
@@ -90,19 +94,37 @@ def synthesize(
             capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
-    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
-        raise ValueError(
-            f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
-            'call mitsuba.set_variant("llvm_ad_rgb") first.'
-        )
+    require(
+        str(mi.variant()).startswith(("llvm", "cuda", "metal")),
+        "synthesize()",
+        "a vectorised variant is needed",
+        repr(mi.variant()),
+        'call mitsuba.set_variant("llvm_ad_rgb") first',
+    )
     config = config or SynthConfig()
-    config.check()
+    check_ranges(config, "synthesize()")
     size = f"images of {config.width}x{config.height} pixels"
     memory = _PIXEL_BYTES * config.width * config.height
     check_memory("synthesize()", memory, size, "make them smaller (`width`, `height`)")
     scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
-    rig = _Rig.of(scene, config.completed(scene.recording))
-    check_lenses(rig.cameras, rig.disturbed)
+    completed = config.completed(scene.recording)
+    assert completed.cameras is not None
+    cameras = scene.rig.cameras(completed.cameras, config.width, config.height)
+    disturbed = draw_disturbances(config.disturbances, len(cameras), config.seed)
+    rig = _Rig(cameras, disturbed, completed)
+    for camera, item in zip(rig.cameras, rig.disturbed, strict=True):
+        if item.distortion < 0:
+            corner = np.linalg.norm(camera.K[:2, 2] / np.diag(camera.K)[:2])
+            # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
+            largest = 2 / (3 * np.sqrt(-3 * item.distortion))
+            require(
+                corner < 0.98 * largest,
+                "synthesize()",
+                "`distortion` must be small enough for the field of view",
+                f"{item.distortion:.3g} with corners at the radius {corner:.3g}, which must be "
+                f"below {largest:.3g}",
+                "set a smaller one",
+            )
     check_scene(scene, rig.times())
     out = Path(out)
     _check_folder(out, overwrite)
@@ -133,16 +155,6 @@ class _Rig:
     disturbed: Sequence[CameraDisturbance]  # disturbance of each camera
     config: SynthConfig  # complete settings
 
-    @classmethod
-    def of(cls, scene: Scene, config: SynthConfig) -> _Rig:
-        assert config.cameras is not None
-        cameras = scene.rig.cameras(config.cameras, config.width, config.height)
-        return cls(
-            cameras,
-            draw_disturbances(config.disturbances, config.cameras, config.seed),
-            config,
-        )
-
     def times(self) -> list[float]:
         """Return the times of the frames, the time after the last one, and the extreme times of
         read rows, seconds.
@@ -159,9 +171,43 @@ class _Rig:
         ]
 
 
-def _write_clips(
-    tracer: PathTracer, rig: _Rig, folder: Path, progress: Callable[[int, int], None] | None
-) -> list[Path]:
+def _mixed_seed(*numbers: int) -> int:
+    """Return a seed that depends on several numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
+def _record_light(
+    tracer: PathTracer,
+    camera: Camera,
+    disturbance: CameraDisturbance,
+    frame: int,
+    config: SynthConfig,
+) -> np.ndarray:
+    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear
+    [H, W, 3].
+
+    Args:
+        tracer: the scene; its time is changed.
+        camera: the view without distortion.
+        disturbance: of the camera.
+        frame: index of the frame.
+        config: samples per pixel, their seed and the frame rate.
+    """
+    assert config.spp is not None
+    if not disturbance.rolling_shutter and not disturbance.distortion:
+        tracer.set_time((frame + disturbance.time_offset) / config.fps)
+        return tracer.light(camera, config.spp, config.seed)
+    row_times = disturbance.row_times(frame, camera.height)
+    count = -(-camera.height // _BAND) if disturbance.rolling_shutter else 1
+    bands = []
+    for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
+        tracer.set_time(row_times[rows].mean() / config.fps)
+        seed = _mixed_seed(config.seed, band)
+        bands.append(tracer.light_of_rows(camera, rows, config.spp, seed, disturbance.lens))
+    return np.concatenate(bands)
+
+
+def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | None) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
     config = rig.config
     noise = config.noise
@@ -172,9 +218,9 @@ def _write_clips(
         for frame in range(config.frames):
             # The noise must differ between views and frames; otherwise it would look like a moving
             # texture.
-            seed = mixed_seed(config.seed, index, frame)
+            seed = _mixed_seed(config.seed, index, frame)
             disturbance = rig.disturbed[index]
-            light = record_light(tracer, camera, disturbance, frame, replace(config, seed=seed))
+            light = _record_light(tracer, camera, disturbance, frame, replace(config, seed=seed))
             yield developed(light, noise, seed)
             if progress is not None:
                 progress(next(count), len(rig.cameras) * config.frames)
@@ -197,17 +243,13 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
     """Raise `ValueError` without light or if a camera sees no object in the first frame; warn of
     black images.
     """
-    if not tracer.has_emitters:
-        raise ValueError(
-            f"scene {tracer.scene.name!r}: it has no emitter, so its images would be black; give "
-            "it lights, e.g. `lights()` of morgs_mi.studio.synth.textures."
-        )
+    where = f"scene {tracer.scene.name!r}"
+    remedy = "give it lights, e.g. `lights()` of morgs_mi.studio.synth.textures"
+    require(tracer.has_emitters, where, "expected an emitter", "none, for black images", remedy)
     for camera in cameras:
-        if not (tracer.surface_points(camera).ids >= 0).any():
-            raise ValueError(
-                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the "
-                "objects, or the centre and distance of the rig."
-            )
+        sees_objects = (tracer.surface_points(camera).ids >= 0).any()
+        requirement = f"{camera.name} must see an object at 0 s"
+        require(sees_objects, where, requirement, "none", "move the objects or the rig")
     if not tracer.render(cameras[0], 1, 0).any():
         _LOG.warning(
             "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the "
@@ -248,11 +290,17 @@ def _sample_tracks(
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points = []
     owners = []
+    can_move = np.array([item.pose is not None for item in tracer.scene.objects.values()])
     poses = [tracer.poses(time) for time in times]
     for start in starts:
         tracer.set_time(times[start])
         for camera in cameras:
-            for sample in _samples(tracer, camera, share, rng):
+            surface = tracer.surface_points(camera)
+            for moving in (False, True):
+                mask = (surface.ids >= 0) & (can_move[surface.ids] == moving)
+                pixels = np.flatnonzero(mask)
+                choice = rng.choice(pixels, min(share, len(pixels)), replace=False)
+                sample = surface.pick(choice)
                 paths = [move_with_objects(sample, poses[start], pose) for pose in poses]
                 points.append(np.stack(paths, axis=1))
                 owners.append(sample.ids)
@@ -263,20 +311,6 @@ def _sample_tracks(
         for camera in cameras:
             visible[camera.name][:, frame] = tracer.sees(camera, tracks[:, frame])
     return Tracks(tracks, np.concatenate(owners), visible)
-
-
-def _samples(
-    tracer: PathTracer, camera: Camera, most: int, rng: np.random.Generator
-) -> Iterator[SurfacePoints]:
-    """Yield random surface points that a camera sees, at most `most` [P]: on the objects that never
-    move, and on the others.
-    """
-    objects = tracer.scene.objects.values()
-    can_move = np.array([item.pose is not None for item in objects])
-    visible = tracer.surface_points(camera)
-    for moving in (False, True):
-        pixels = np.flatnonzero((visible.ids >= 0) & (can_move[visible.ids] == moving))
-        yield visible.pick(rng.choice(pixels, min(most, len(pixels)), replace=False))
 
 
 def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
@@ -322,20 +356,12 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
 
 def _check_folder(out: Path, overwrite: bool) -> None:
     """Raise `FileExistsError` if `out` must not be replaced."""
-    if out.exists() and not out.is_dir():
-        raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
-    if not out.is_dir() or all(is_added(file.name) for file in out.iterdir()):
-        return
-    if not overwrite:
-        raise FileExistsError(
-            f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`."
-        )
+    is_empty = out.is_dir() and all(is_added(file.name) for file in out.iterdir())
     # Recordings and fits have a `capture.json` too.
-    if not {"scene", "spp"} <= set(stored_settings(out)):
-        raise FileExistsError(
-            f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose "
-            "another folder."
-        )
+    is_synthetic = {"scene", "spp"} <= set(stored_settings(out))
+    if out.exists() and not is_empty and not (overwrite and is_synthetic):
+        reason = "is not a synthetic capture" if overwrite else "is not empty"
+        raise FileExistsError(f"synthesize(): {out} {reason}; choose another folder.")
 
 
 def stored_settings(folder: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from morgs_mi.studio.synth.scene import Light, Object
@@ -58,8 +59,6 @@ def textured(
         repeat: repetitions of the texture along u and v, which avoid stretching on long, thin
             shapes.
     """
-    import mitsuba as mi
-
     to_uv = mi.ScalarTransform4f().scale([*repeat, 1])
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True, "to_uv": to_uv}
     if roughness is None:
@@ -110,8 +109,6 @@ def _wall(
     center: Sequence[float], axis: Sequence[float], angle: float, half_size: Sequence[float]
 ) -> Any:
     """Return the transform of a rectangle with a centre, a rotation in degrees and a half size."""
-    import mitsuba as mi
-
     return mi.ScalarTransform4f().translate(center).rotate(axis, angle).scale([*half_size, 1])
 
 
@@ -133,8 +130,6 @@ def _lamp(
     radiance: list[float],
 ) -> Light:
     """Return a square lamp that faces a point."""
-    import mitsuba as mi
-
     look = mi.ScalarTransform4f().look_at(origin=origin, target=target, up=up)
     return Light(
         {

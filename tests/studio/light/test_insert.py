@@ -163,7 +163,7 @@ BAD = {
     "missing.py": (None, "expected a scene to insert, FILE.xml or FILE.py, got none"),
     "a.json": ("{}", "FILE.xml or FILE.py, got '.json'"),
     "syntax.py": ("def build(:", "syntax.py, line 1: SyntaxError"),
-    "empty.py": ("", r"expected a function `build\(frame, time\)`"),
+    "empty.py": ("", r"must define `build\(frame, time\) -> dict`"),
     "none.py": (
         "def build(frame, time):\n    pass\n",
         "`build` must return a dict, got a NoneType",

@@ -93,15 +93,15 @@ def test_rig__test_view_is_at_the_centre():
 @pytest.mark.parametrize(
     ("code", "message"),
     [
-        ("", r"scene.py must define `build\(seed\) -> Scene`"),
-        ("build = 3", r"scene.py must define `build\(seed\) -> Scene`"),
-        ("def build(): pass", r"`build` in .*scene.py must take the seed alone.*got `build\(\)`"),
+        ("", r"scene.py: it must define `build\(seed\) -> Scene`"),
+        ("build = 3", r"scene.py: it must define `build\(seed\) -> Scene`"),
+        ("def build(): pass", r"scene.py: TypeError: build\(\) takes 0 positional arguments but 1"),
         (
             "def build(seed, size): pass",
-            r"must take the seed alone.*got `build\(seed, size\)`; give further parameters",
+            r"scene.py: TypeError: build\(\) missing 1 required positional argument: 'size'",
         ),
-        ("def build(seed): pass", "`build` in .*scene.py must return a Scene, got None"),
-        ("def build(seed): return {}", "must return a Scene, got a dict"),
+        ("def build(seed): pass", r"`build\(seed\) of .*scene.py` must be a .*Scene, got a None"),
+        ("def build(seed): return {}", r"must be a .*Scene, got a dict; return Scene"),
         (
             "import nowhere\n",
             "scene.py, line 1: ModuleNotFoundError: No module named 'nowhere'; correct the scene",
