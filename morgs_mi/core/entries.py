@@ -38,7 +38,7 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
         "onnx-signed": "networks.flow_network:onnx_signed",
     },
     "mask refiners": {"sam2": "networks.sam2:sam2"},
-    "image distances": {"lpips": "measures.lpips:Lpips"},
+    "image distances": {"lpips": "networks.lpips:Lpips"},
 }
 """Entries by registry and name, as MODULE or MODULE:NAME inside `morgs_mi.studio`."""
 

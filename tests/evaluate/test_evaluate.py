@@ -26,7 +26,7 @@ from morgs_mi.evaluate.tables import evaluation_summary
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.studio.measures.lpips import Lpips
+from morgs_mi.studio.networks.lpips import Lpips
 from tests.scenes.moving_splats import (
     CAMERAS,
     EXACT,

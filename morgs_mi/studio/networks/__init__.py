@@ -1,1 +1,1 @@
-"""Networks in ONNX files, for flow and masks."""
+"""Networks in ONNX files, for flow, masks and measures."""

@@ -11,11 +11,14 @@ flow is resized back and scaled by the same factors.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.method.flow_sources.flow_registry import FlowConfig, FlowSource, both_directions
 from morgs_mi.studio.networks.onnx_file import OnnxNetwork, written_shapes
@@ -42,25 +45,18 @@ class FlowNetwork:
         self.path = Path(path)
         self.low = low
         self.high = high
-        self._net = OnnxNetwork(path, " or use its flow from files")
+        self._net = OnnxNetwork(path)
         shapes = list(self._net.inputs.values())
-        if (
-            len(shapes) != 2
-            or shapes[0] != shapes[1]
-            or len(shapes[0]) != 4
-            or shapes[0][0] not in (1, None)
-            or shapes[0][1] not in (3, None)
-        ):
-            raise ValueError(
-                f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
-                f"{written_shapes(shapes)}; export it with one input per image."
-            )
-        height, width = shapes[0][2:]
-        if (height is None) != (width is None):
-            raise ValueError(
-                f"{path}: expected height and width both fixed or both open, got "
-                f"{written_shapes(shapes[:1])}."
-            )
+        first: Any = shapes[0] if shapes else ()
+        is_image = len(first) == 4 and first[0] in (1, None) and first[1] in (3, None)
+        require(
+            is_image and shapes == [first] * 2 and (first[2] is None) == (first[3] is None),
+            str(path),
+            "expected two images [1, 3, H, W] as inputs, H and W both fixed or both open",
+            written_shapes(shapes),
+            "export it with one input per image",
+        )
+        height, width = first[2:]
         self._size = None if height is None or width is None else (width, height)
 
     def __call__(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -88,10 +84,6 @@ class FlowNetwork:
             images = (cv2.resize(each, self._size, interpolation=cv2.INTER_AREA) for each in pair)
             flow = cv2.resize(self._run(*images), (width, height), interpolation=cv2.INTER_LINEAR)
             flow = flow * np.array((width / self._size[0], height / self._size[1]), np.float32)
-        if not np.isfinite(flow).all():
-            raise ValueError(
-                f"{self.path}: expected a finite flow, got NaN or infinity; check the value range."
-            )
         return flow
 
     def _run(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -104,26 +96,21 @@ class FlowNetwork:
         shape = (1, 2, *image.shape[:2])
         # A network that returns the flow of each of its iterations returns the best one last.
         flows = [output for output in outputs if output.shape == shape]
-        if not flows:
-            shapes = written_shapes([output.shape for output in outputs])
-            raise ValueError(f"{self.path}: expected an output {[*shape]}, the flow, got {shapes}.")
+        shapes = written_shapes(output.shape for output in outputs)
+        requirement = f"expected an output {[*shape]}, the flow"
+        require(flows, str(self.path), requirement, shapes, "export another network")
         return np.ascontiguousarray(np.moveaxis(flows[-1][0], 0, 2), dtype=np.float32)
 
 
-def onnx(path: str, config: FlowConfig) -> FlowSource:
-    """Return the flow source of a network that takes values from 0 to 255, as RAFT's and SEA-RAFT's
-    own code does.
-    """
-    return both_directions(FlowNetwork(path, 0, 255))
+def _source(low: float, high: float, path: str, config: FlowConfig) -> FlowSource:
+    return both_directions(FlowNetwork(path, low, high))
 
 
-def onnx_unit(path: str, config: FlowConfig) -> FlowSource:
-    """Return the flow source of a network that takes values from 0 to 1."""
-    return both_directions(FlowNetwork(path, 0, 1))
+onnx = partial(_source, 0, 255)
+"""Flow source of a network that takes values from 0 to 255, as RAFT's and SEA-RAFT's own code."""
 
+onnx_unit = partial(_source, 0, 1)
+"""Flow source of a network that takes values from 0 to 1."""
 
-def onnx_signed(path: str, config: FlowConfig) -> FlowSource:
-    """Return the flow source of a network that takes values from -1 to 1, as torchvision's RAFT
-    does.
-    """
-    return both_directions(FlowNetwork(path, -1, 1))
+onnx_signed = partial(_source, -1, 1)
+"""Flow source of a network that takes values from -1 to 1, as torchvision's RAFT does."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from morgs_mi.core.checks import kind_of, require
 from morgs_mi.core.color_space import unit_values
 
 # Mean and standard deviation of ImageNet's colours, by which most networks for images normalise
@@ -31,7 +33,6 @@ class OnnxNetwork:
 
     Args:
         path: the ONNX file.
-        instead: alternative that error messages name, e.g. " or use its flow from files".
 
     Attributes:
         path: the ONNX file.
@@ -44,9 +45,8 @@ class OnnxNetwork:
             many values.
     """
 
-    def __init__(self, path: str | Path, instead: str = "") -> None:
+    def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._alternative = instead
         if not self.path.is_file():
             raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
         try:
@@ -77,18 +77,13 @@ class OnnxNetwork:
         except Exception as error:  # its errors have no class in common
             raise ValueError(
                 f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it "
-                f"again{instead}."
+                "again."
             ) from error
-        large = [
-            shape
-            for shape in self.inputs.values()
-            if math.prod(size or 1 for size in shape) > _MAX_VALUES
-        ]
-        if large:
-            raise ValueError(
-                f"{path}: expected inputs of at most {_MAX_VALUES} values, got "
-                f"{written_shapes(large)}; export it for smaller images."
-            )
+        requirement = f"expected inputs of at most {_MAX_VALUES} values"
+        counts = [math.prod(size or 1 for size in shape) for shape in self.inputs.values()]
+        got = written_shapes(self.inputs.values())
+        is_small = max(counts, default=0) <= _MAX_VALUES
+        require(is_small, str(path), requirement, got, "export it for smaller images")
 
     def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return all outputs by name, in their order.
@@ -98,7 +93,7 @@ class OnnxNetwork:
 
         Raises:
             ValueError: `onnxruntime` cannot run the network on them, or it returns other values
-                than numbers.
+                than finite numbers.
         """
         try:
             results = self._session.run(None, dict(inputs))
@@ -106,20 +101,16 @@ class OnnxNetwork:
             shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in inputs.items())
             raise ValueError(
                 f"{self.path}: {self._runtime} cannot run this network on {shapes} "
-                f"({_reason(error)}); export it for these sizes{self._alternative}."
+                f"({_reason(error)}); export it for these sizes."
             ) from error
-        arrays: dict[str, np.ndarray] = {}
-        others: list[str] = []
-        for name, value in zip(self.outputs, results, strict=True):
-            if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-                arrays[name] = value
-            else:
-                others.append(name)
-        if others:
-            raise ValueError(
-                f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; "
-                "export again."
-            )
+        arrays: dict[str, Any] = dict(zip(self.outputs, results, strict=True))
+        for name, value in arrays.items():
+            is_array = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+            place = f"{self.path}, output {name}"
+            require(is_array, place, "expected numbers", kind_of(value), "export again")
+            remedy = "check the value range, or export it in float32"
+            is_finite = np.isfinite(value).all()
+            require(is_finite, place, "expected finite numbers", "NaN or infinity", remedy)
         return arrays
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.core.checks import require
 from morgs_mi.core.documentation import page
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig, MaskRefiner
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask
@@ -61,22 +62,26 @@ class SegmentNetwork:
         self._encoder = OnnxNetwork(encoder)
         self._decoder = OnnxNetwork(decoder)
         shapes = list(self._encoder.inputs.values())
-        if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
-            raise ValueError(
-                f"{encoder}: expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}], "
-                f"got {written_shapes(shapes)}; give the encoder first, then the decoder."
-            )
+        require(
+            len(shapes) == 1 and len(shapes[0]) == 4 and shapes[0][1] == 3,
+            str(encoder),
+            f"expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}]",
+            written_shapes(shapes),
+            "give the encoder first, then the decoder",
+        )
         height, width = (side or _SIZE for side in shapes[0][2:])
         self._size = (width, height)
         names = {*self._encoder.outputs, *_PROMPTS}
         inputs = self._decoder.inputs
         outputs = self._decoder.outputs
-        if not set(_PROMPTS[:2]) <= set(inputs) <= names or not set(_RESULTS) <= set(outputs):
-            raise ValueError(
-                f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(names))} "
-                f"and outputs {' and '.join(_RESULTS)}, got {', '.join(inputs)} and "
-                f"{', '.join(outputs)}; export both networks as described in {page('masks')}."
-            )
+        require(
+            set(_PROMPTS[:2]) <= set(inputs) <= names and set(_RESULTS) <= set(outputs),
+            str(decoder),
+            f"expected a mask decoder with inputs among {', '.join(sorted(names))} and outputs "
+            f"{' and '.join(_RESULTS)}",
+            f"{', '.join(inputs)} and {', '.join(outputs)}",
+            f"export both networks as described in {page('masks')}",
+        )
 
     def __call__(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Return the mask of the objects [H, W] bool; it is empty if `mask` is.
@@ -90,14 +95,16 @@ class SegmentNetwork:
                 SAM2's.
         """
         objects = np.zeros(mask.shape, bool)
-        components = _components(mask, self._count)
-        if not components:
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+        if count == 1:
             return objects
+        # The largest components first; 0 is the background.
+        order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA], kind="stable")
         features = self._encoder.run(
             {next(iter(self._encoder.inputs)): imagenet_blob(image, *self._size)}
         )
-        for component in components:
-            objects |= self._segment(features, component)
+        for label in order[: self._count]:
+            objects |= self._segment(features, labels == label)
         return objects
 
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
@@ -118,19 +125,16 @@ class SegmentNetwork:
             "mask_input": np.zeros((1, 1, *quarter), np.float32),
             "has_mask_input": np.zeros(1, np.float32),
         }
-        path = self._decoder.path
         results = self._decoder.run({name: inputs[name] for name in self._decoder.inputs})
         masks, quality = (results[name] for name in _RESULTS)
-        if masks.ndim != 4 or quality.shape != masks.shape[:2] or len(masks) != 1:
-            raise ValueError(
-                f"{path}: expected masks [1, M, H, W] and iou_predictions [1, M], "
-                f"got {list(masks.shape)} and {list(quality.shape)}."
-            )
+        require(
+            masks.ndim == 4 and quality.shape == masks.shape[:2] and len(masks) == 1,
+            str(self._decoder.path),
+            "expected masks [1, M, H, W] and iou_predictions [1, M]",
+            f"{list(masks.shape)} and {list(quality.shape)}",
+            "export the decoder again",
+        )
         logits = masks[0, np.argmax(quality[0])].astype(np.float32)
-        if not np.isfinite(logits).all():
-            raise ValueError(
-                f"{path}: expected finite masks, got NaN or infinity; export in float32."
-            )
         return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
 
@@ -166,22 +170,11 @@ def prompts(
     return np.array([upper_left, lower_right, *points], np.float32), np.array(labels, np.float32)
 
 
-def _components(mask: np.ndarray, most: int) -> list[np.ndarray]:
-    """Return the mask's largest connected components [H, W] bool, at most `most`, the largest
-    first.
-    """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA], kind="stable")
-    return [labels == label for label in order[:most]]
-
-
 def sam2(files: str, config: MaskConfig) -> MaskRefiner:
     """Return the mask refiner of two files, ENCODER.onnx,DECODER.onnx."""
     encoder, _, decoder = files.partition(",")
-    if not encoder or not decoder:
-        raise ValueError(
-            "MotionConfig(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got "
-            f"{'sam2:' + files!r}."
-        )
+    requirement = "`mask_method` must be sam2:ENCODER.onnx,DECODER.onnx"
+    got = repr(f"sam2:{files}")
+    require(encoder and decoder, "MotionConfig()", requirement, got, "name both files")
     network = SegmentNetwork(encoder, decoder, config.prompts)
     return lambda image, mask: mask | network(image, clean_mask(mask))

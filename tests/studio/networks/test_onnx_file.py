@@ -132,7 +132,7 @@ def test_onnx_network__refuses_damaged_files_with_one_sentence(tmp_path, capfd):
 def test_onnx_network__refuses_results_that_are_not_numbers(tmp_path):
     graph = "text (float[1, 2] image) => (string[1, 2] text) { text = Cast <to = 8> (image) }"
     with pytest.raises(
-        ValueError, match=r"a\.onnx: expected arrays of numbers, got others from text"
+        ValueError, match=r"a\.onnx, output text: expected numbers, got object \[1, 2\]"
     ):
         OnnxNetwork(write(tmp_path / "a.onnx", graph)).run({"image": np.zeros((1, 2), np.float32)})
 

@@ -149,7 +149,7 @@ def test_mask_refiner__rejects_files_that_are_not_sam2(tmp_path, files, pair, me
 
 def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):
     image, (disc,) = discs(60, 80, (40, 30))
-    with pytest.raises(ValueError, match=r"decoder\.onnx: expected finite masks"):
+    with pytest.raises(ValueError, match=r"decoder\.onnx, output masks: expected finite"):
         SegmentNetwork(files[0], export_decoder(tmp_path / "decoder.onnx", scale=float("inf")))(
             image, disc
         )

@@ -18,11 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from morgs_mi.core.checks import require
 from morgs_mi.evaluate.metrics import unit_pair
 from morgs_mi.studio.networks.onnx_file import OnnxNetwork
 
 _INPUTS = ("in0", "in1")
-_ADVICE = "export the network as the documentation of morgs_mi.studio.measures.lpips shows"
+_ADVICE = "export the network as the documentation of morgs_mi.studio.networks.lpips shows"
 
 
 class Lpips:
@@ -43,11 +44,9 @@ class Lpips:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._network = OnnxNetwork(path)
-        if {*self._network.inputs} != {*_INPUTS}:
-            raise ValueError(
-                f"{path}: expected a network with inputs {' and '.join(_INPUTS)}, got "
-                f"{', '.join(self._network.inputs)}; {_ADVICE}."
-            )
+        names = self._network.inputs
+        requirement = f"expected a network with inputs {' and '.join(_INPUTS)}"
+        require({*names} == {*_INPUTS}, str(path), requirement, ", ".join(names), _ADVICE)
 
     def distance_map(self, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         """Return the distance per pixel [H, W], or of the whole image [1, 1] if the network returns
@@ -68,14 +67,7 @@ class Lpips:
             for name, each in zip(_INPUTS, pair, strict=True)
         }
         distance = next(iter(self._network.run(blobs).values()))
-        if distance.size not in (1, H * W):
-            raise ValueError(
-                f"{self.path}: expected one distance, or one for each of {W}x{H} pixels, got "
-                f"{list(distance.shape)}; {_ADVICE}."
-            )
-        if not np.isfinite(distance).all():
-            raise ValueError(
-                f"{self.path}: expected finite distances, got NaN or infinity; export it in "
-                "float32."
-            )
+        requirement = f"expected one distance, or one for each of {W}x{H} pixels"
+        is_map = distance.size in (1, H * W)
+        require(is_map, str(self.path), requirement, list(distance.shape), _ADVICE)
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))

@@ -1,1 +1,0 @@
-"""Measures of an evaluation that need a network."""
