@@ -14,10 +14,10 @@ from typing import Any
 
 STUDIO: Mapping[str, Mapping[str, str]] = {
     "commands": {
-        "calibrate": "commands.calibrate:Calibrate",
+        "calibrate": "commands.captures:Calibrate",
         "demo": "commands.demo:Demo",
         "import": "commands.import_frames:Import",
-        "info": "commands.info:Info",
+        "info": "commands.captures:Info",
         "live": "commands.live:Live",
         "sweep": "commands.sweep:Sweep",
         "synth": "commands.synth:Synth",

@@ -18,10 +18,9 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.fit_names import REPORT
-from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.progress import Progress, Report, Steps
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
-from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
@@ -69,38 +68,11 @@ class DemoConfig:
     """The fit, with a shortened, smaller first frame; its seed is also the clip's."""
 
 
-@dataclass(frozen=True)
-class DemoReport:
-    """Results of the demonstration."""
-
-    config: DemoConfig  #: The settings.
-    full: Evaluation  #: Evaluation of the fit with motion, offset and confidence.
-    plain: Evaluation  #: Evaluation of the fit without.
-    compared_frames: list[int]  #: Indices of the frames that both fits have, without the first.
-    #: Mean scores over these frames, by fit (``full``, ``plain``) and by name.
-    comparison: dict[str, dict[str, float | None]]
-    seconds: dict[str, float]  #: Wall time by step, and ``total``.
-    machine: dict[str, Any]  #: The machine, see `core.environment`.
-    versions: dict[str, str]  #: Of the libraries, likewise.
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the content of ``report.json``."""
-        return {
-            "config": asdict(self.config),
-            "seed": self.config.stream.seed,
-            "comparison": {"frames": self.compared_frames, **self.comparison},
-            "seconds": self.seconds,
-            "machine": self.machine,
-            "versions": self.versions,
-            "full": self.full.as_dict(),
-            "plain": self.plain.as_dict(),
-        }
-
-
 def run_demo(
     out: str | Path, config: DemoConfig | None = None, progress: Report | None = None
-) -> DemoReport:
-    """Synthesise a clip, fit it, and write images and results of its held-out view into `out`.
+) -> dict[str, Any]:
+    """Synthesise a clip, fit it, write images and results of its held-out view into `out`, and
+    return the content of ``report.json``.
 
     The folder contains ``capture/`` (reused if it has the same settings), ``stream/``,
     ``stream_plain/``, ``side_by_side.mp4`` (truth, render, motion, confidence),
@@ -145,7 +117,8 @@ def run_demo(
         run_step("Drawing", lambda report: _draw(root, load_capture(capture), report))
         # The frames that both fits have, without the first, which has no motion.
         count = min(result.num_frames for result in results.values())
-        comparison = {}
+        frames = [row.frame for row in results["full"].frames[1:count]]
+        comparison: dict[str, Any] = {"frames": frames}
         for name, result in results.items():
             scores = [asdict(frame.scores) for frame in result.frames[1:count]]
             comparison[name] = {
@@ -153,17 +126,16 @@ def run_demo(
                 for score in _COMPARED
             }
         seconds["total"] = sum(seconds.values())
-        report = DemoReport(
-            config,
-            results["full"],
-            results["plain"],
-            [row.frame for row in results["full"].frames[1:count]],
-            comparison,
-            seconds,
-            machine(),
-            versions(),
-        )
-        write_json(root / REPORT, report.as_dict())
+        report = {
+            "config": asdict(config),
+            "seed": config.stream.seed,
+            "comparison": comparison,
+            "seconds": seconds,
+            "machine": machine(),
+            "versions": versions(),
+            **{name: result.as_dict() for name, result in results.items()},
+        }
+        write_json(root / REPORT, report)
         return report
 
 
@@ -196,9 +168,7 @@ def _fit_plain(root: Path, config: DemoConfig, progress: Progress) -> None:
     _fit(capture, out, plain, progress, resume=True)
 
 
-def _synthesize_clip(
-    folder: Path, config: DemoConfig, report: Callable[[float, float], None]
-) -> None:
+def _synthesize_clip(folder: Path, config: DemoConfig, report: Steps) -> None:
     """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is
     complete.
     """
@@ -211,7 +181,7 @@ def _synthesize_clip(
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
 
 
-def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -> None:
+def _draw(out: Path, capture: Capture, report: Steps) -> None:
     """Write the video and the contact sheet."""
     scale = motion_scale(capture, capture.cameras[capture.reference_view])
     full = _panels(capture, out / "stream", scale)

@@ -15,7 +15,7 @@ frames.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,10 +26,11 @@ from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
+from morgs_mi.core.checks import check_number, require
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Steps
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
@@ -62,7 +63,7 @@ def import_frames(
     fps: float = 30.0,
     config: CodecConfig | None = None,
     axes: Axes = "y-down",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
     most_invalid: float = 0.0,
 ) -> Imported:
     """Write files with Gaussians, one per frame, as a stream, and return a summary; the stream is
@@ -158,39 +159,27 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         ValueError: there are no such files, or they have several formats.
     """
     paths = [Path(source) for source in sources]
-    for path in paths:
-        if not path.exists():
-            raise FileNotFoundError(
-                f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
-            )
-    if len(paths) == 1 and paths[0].is_dir():
-        folder = paths[0]
-        files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
-        paths = sorted(files, key=lambda path: natural_key(path.name))
-        if not paths:
-            for file in listed(folder):
-                refuse_foreign(file)
-            raise ValueError(
-                f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
-                "convert the frames."
-            )
-    if not paths:
-        raise ValueError(
-            "import_frames(): `sources` must be a folder or at least one file, got none."
+    place = str(paths[0]) if paths else "import_frames()"
+    if missing := [path for path in paths if not path.exists()]:
+        raise FileNotFoundError(
+            f"{missing[0]}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
         )
+    if len(paths) == 1 and paths[0].is_dir():
+        files = sorted(listed(paths[0]), key=lambda path: natural_key(path.name))
+        paths = [path for path in files if path.is_file() and suffix_of(path)]
+        for file in files if not paths else ():
+            refuse_foreign(file)
+    kinds = f"files whose names end in {', '.join(SUFFIXES)}"
+    require(paths, place, f"expected a folder with {kinds}", "none", "convert the frames")
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
         refuse_foreign(first[None])
         raise ValueError(
-            f"{first[None]}: expected one folder, or files whose names end in "
-            f"{', '.join(SUFFIXES)}, got another; convert it, or leave it out."
+            f"{first[None]}: expected one folder, or {kinds}, got another; convert it."
         )
-    if len(first) > 1:
-        names = " and ".join(path.name for path in first.values())
-        raise ValueError(
-            f"{paths[0].parent}: expected frames of one format, got {names}; name the files of "
-            "one of them."
-        )
+    names = " and ".join(path.name for path in first.values())
+    remedy = "name the files of one of them"
+    require(len(first) == 1, place, "expected frames of one format", names, remedy)
     return paths
 
 

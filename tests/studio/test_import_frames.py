@@ -190,7 +190,7 @@ def test_find_frames__orders_by_number(tmp_path):
         (
             ["a.txt"],
             ["."],
-            "expected files whose names end in .compressed.ply, .ply, .splat, got none",
+            "expected a folder with files whose names end in .compressed.ply, .ply, .*, got none",
         ),
         (
             ["a.ply", "a.splat"],
@@ -203,7 +203,11 @@ def test_find_frames__orders_by_number(tmp_path):
             "b.obj: expected one folder, or files whose names end in",
         ),
         (["a.ply"], ["a.ply", "."], "expected one folder, or files whose names end in"),
-        ([], [], "`sources` must be a folder or at least one file, got none"),
+        (
+            [],
+            [],
+            r"import_frames\(\): expected a folder with files whose names end in .*, got none",
+        ),
     ],
 )
 def test_find_frames__names_what_does_not_fit(tmp_path, create, named, message):

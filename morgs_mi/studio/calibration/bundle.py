@@ -166,17 +166,8 @@ def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.
     pinhole camera.
     """
     from_centre = pixels - camera.K[:2, 2]
-    square = _square_radius(camera, from_centre)
+    square = np.sum((from_centre / np.diag(camera.K)[:2]) ** 2, axis=-1, keepdims=True)
     return pixels + from_centre * (distortion[0] + distortion[1] * square) * square
-
-
-def _focal_lengths(camera: Camera) -> np.ndarray:
-    return camera.K[[0, 1], [0, 1]]
-
-
-def _square_radius(camera: Camera, from_centre: np.ndarray) -> np.ndarray:
-    """Return r^2 [n, 1] of pixels at positions [n, 2] relative to the principal point."""
-    return np.sum((from_centre / _focal_lengths(camera)) ** 2, axis=-1, keepdims=True)
 
 
 def undistorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
@@ -206,41 +197,23 @@ def camera_jacobian(
         points: [n, 3], world units; the derivatives of points behind the near plane are zero.
         distortion: k [2] so far, of images that are not undistorted by it; default: none.
     """
-    by_point = camera.projection_jacobian(points)
     R = np.asarray(camera.viewmat, np.float64)[:3, :3]
     x = (points - camera.position) @ R.T
     front = x[:, 2] > camera.near
-    from_centre = camera.project(points[front])[0] - camera.K[:2, 2]
-    J = np.zeros((len(x), 2, CHANGES))
-    J[:, :, :3] = by_point @ R.T @ -_cross(x)
-    J[:, :, 3:6] = -by_point
-    J[front, :, 6] = from_centre / factor
-    J[front, 0, 7] = camera.width
-    J[front, 1, 8] = camera.width
-    square = _square_radius(camera, from_centre)
-    J[front, :, 9] = from_centre * square
-    J[front, :, 10] = from_centre * square**2
-    if distortion is not None and distortion.any():
-        scale, by_pixel = _distortion_jacobian(camera, from_centre, distortion)
-        J[front, :, :7] = by_pixel @ J[front, :, :7]
-        by_point[front] = by_pixel @ by_point[front]
-        J[front, :, 6] = from_centre * scale / factor
-    return J, by_point
-
-
-def _distortion_jacobian(
-    camera: Camera, from_centre: np.ndarray, distortion: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the factors [n, 1] by which distortion k [2] moves pixels away from the principal
-    point, and the derivatives [n, 2, 2] of the distorted pixels by the pixels.
-    """
-    k1, k2 = distortion
-    focal = _focal_lengths(camera)
-    square = _square_radius(camera, from_centre)
-    scale = 1 + (k1 + k2 * square) * square
-    slope = 2 * k1 + 4 * k2 * square
-    by_square = np.einsum("ni,nj,j->nij", from_centre, from_centre / focal, 1 / focal)
-    return scale, scale[..., None] * np.eye(2) + slope[..., None] * by_square
+    of_changes = np.zeros((len(x), 2, CHANGES))
+    of_points = np.zeros((len(x), 2, 3))
+    if front.any():
+        terms = np.append(np.zeros(2) if distortion is None else distortion, (0.0, 0.0))
+        # By a rotation and a displacement of the points, f, c and k.
+        pose = np.zeros(3)
+        J = cv2.projectPoints(x[front], pose, pose, camera.K, terms)[1].reshape(-1, 2, 14)
+        of_points[front] = J[:, :, 3:6] @ R
+        of_changes[front, :, :3] = J[:, :, :3]
+        of_changes[front, :, 6] = J[:, :, 6:8] @ np.diag(camera.K)[:2] / factor
+        of_changes[front, :, 7:9] = camera.width * J[:, :, 8:10]
+        of_changes[front, :, 9:] = J[:, :, 10:12]
+    of_changes[:, :, 3:6] = -of_points
+    return of_changes, of_points
 
 
 class NormalEquations:

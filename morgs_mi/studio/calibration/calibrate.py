@@ -11,10 +11,13 @@ The scale and the up direction of the model's world are arbitrary: images do not
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,13 +36,14 @@ from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import few, require
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
+from morgs_mi.core.progress import Report
 from morgs_mi.io.video import open_clips
 from morgs_mi.studio.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
-from morgs_mi.studio.calibration.colmap_library import import_pycolmap
 
 Mapper = Literal["incremental", "global"]
 
@@ -133,11 +137,26 @@ class Candidate:
         return fits.count(True), len(fits) - fits.count(None), -self.error
 
 
+def import_pycolmap() -> Any:
+    """Return the module pycolmap, and restore the signal handlers of Ctrl-C and SIGTERM after its
+    import.
+
+    The logging library of pycolmap installs a handler for SIGTERM that prints a stack trace and
+    aborts the process.
+    """
+    pycolmap = import_module("pycolmap")
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if (handler := signal.getsignal(number)) is not None:
+                signal.signal(number, handler)
+    return pycolmap
+
+
 def calibrate(
     path: str | Path,
     config: CalibrateConfig | None = None,
     overwrite: bool = False,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Report | None = None,
     without: Sequence[str] = (),
 ) -> CalibrationResult:
     """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written
@@ -186,13 +205,14 @@ def calibrate(
             best.mapper,
             best.principal_points,
         )
-        if result.left_out and not config.partial:
-            raise ValueError(
-                f"{path}: expected to register all {len(result.checks)} cameras, got "
-                f"{len(result.cameras)}, without {', '.join(result.left_out)}: move these so that "
-                f"neighbours see the same objects, {_MORE_TEXTURE}, calibrate on another frame "
-                "(--frame), or accept the partial model (--partial)."
-            )
+        require(
+            config.partial or not result.left_out,
+            str(path),
+            f"expected to register all {len(result.checks)} cameras",
+            f"{len(result.cameras)}, without {', '.join(result.left_out)}",
+            f"move these so that neighbours see the same objects, {_MORE_TEXTURE}, calibrate on "
+            "another frame (--frame), or accept the partial model (--partial)",
+        )
         # Images of a folder of photos are named after their files, which other programs open by
         # these names.
         files = {} if clips_by_camera(path) else photos(path)
@@ -284,10 +304,8 @@ def _frames(
     }
     short = [name for name, last in last_frames.items() if not 0 <= config.frame <= last]
     if short:
-        raise ValueError(
-            f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose "
-            "another."
-        )
+        names = ", ".join(short)
+        raise ValueError(f"{path}: frame {config.frame} is not in the clips of {names}.")
     frames = {}
     for name, reader in readers.items():
         position = int(nearest_frames(reader, np.array([config.frame]))[0])
@@ -302,11 +320,9 @@ def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
     """Return the files of at least two cameras by name, except of those to leave out."""
     clips = clips_by_camera(path) or photos(path) or clips_by_rig(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
-    if broken := [name for name in clips if "\n" in name]:
-        raise ValueError(
-            f"{path}: expected names without line feeds, as COLMAP has one image a line, got "
-            f"{broken[0]!r}; rename it."
-        )
+    requirement = "expected names without line feeds, as COLMAP has one image a line"
+    broken = [name for name in clips if "\n" in name]
+    require(not broken, str(path), requirement, repr(few(broken)), "rename it")
     if len(clips) < 2:
         names = ", ".join(clips) or "none"
         raise ValueError(
@@ -322,7 +338,7 @@ def match_views(
     masks: dict[str, np.ndarray],
     scratch: Path,
     config: CalibrateConfig,
-    report: Callable[[str, int, int], None],
+    report: Report,
 ) -> None:
     """Write images, features and matches of all pairs of views into a folder, for `map_views`.
 
@@ -455,7 +471,17 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     """
     pycolmap = import_pycolmap()
 
-    model = _with_own_cameras(candidate.model)
+    model = pycolmap.Reconstruction()  # a copy in which no two images share a camera
+    for i in candidate.model.reg_image_ids():
+        image = candidate.model.image(i)
+        camera = pycolmap.Camera(candidate.model.camera(image.camera_id).todict())
+        camera.camera_id = i
+        model.add_camera_with_trivial_rig(camera)
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
+        model.add_image_with_trivial_frame(image_copy, image.cam_from_world())
+    for point in candidate.model.points3D.values():
+        model.add_point3D(point.xyz, point.track, point.color)
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)
@@ -472,24 +498,6 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     if not new_error < (1 - _LEAST_DECREASE) * old_error:
         return candidate
     return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
-
-
-def _with_own_cameras(model: Any) -> Any:
-    """Return a copy of a model in which no two images share a camera."""
-    pycolmap = import_pycolmap()
-
-    copy = pycolmap.Reconstruction()
-    for i in model.reg_image_ids():
-        image = model.image(i)
-        camera = pycolmap.Camera(model.camera(image.camera_id).todict())
-        camera.camera_id = i
-        copy.add_camera_with_trivial_rig(camera)
-        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
-        copy.add_image_with_trivial_frame(image_copy, image.cam_from_world())
-    for point in model.points3D.values():
-        copy.add_point3D(point.xyz, point.track, point.color)
-    return copy
 
 
 def _median_error(model: Any) -> float:

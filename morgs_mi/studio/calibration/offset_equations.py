@@ -31,7 +31,7 @@ motion along the epipolar lines of two cameras.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -68,13 +68,8 @@ class OffsetEquations:
     train: np.ndarray  #: Mask of the training views, bool [V].
 
     def __add__(self, other: OffsetEquations) -> OffsetEquations:
-        return OffsetEquations(
-            self.matrix + other.matrix,
-            self.right + other.right,
-            self.scatter + other.scatter,
-            self.own + other.own,
-            self.train,
-        )
+        names = ("matrix", "right", "scatter", "own")
+        return replace(self, **{n: getattr(self, n) + getattr(other, n) for n in names})
 
     def solution(self, share: float = 1.0) -> np.ndarray:
         """Return o [V] in frames, with a mean of zero over the training views.
@@ -152,29 +147,19 @@ def offset_equations(
     H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
     b = np.einsum("vkai,vka->vki", J, b)
     c = np.einsum("vkij,kj->vki", H, d)
-    weights = np.einsum("vki,kij->vkj", c, _inverses(H[train].sum(axis=0)))
+    curvatures = H[train].sum(axis=0)
+    prior = _PRIOR * np.trace(curvatures, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
+    inverses = np.linalg.inv(curvatures + prior[:, None, None] * np.eye(3))
+    weights = np.einsum("vki,kij->vkj", c, inverses)
     parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
-    groups = _grouped(parts, means)
+    groups = parts
+    if len(means):  # Gaussians with the same nearest centre form a group
+        _, labels = KDTree(means[::_GROUP]).query(means)
+        groups = np.stack([np.bincount(labels, row) for row in parts])
     diagonal = np.einsum("vki,ki->v", c, d)
     matrix = np.diag(diagonal)
     matrix[:, train] -= np.einsum("vki,wki->vw", weights, c[train])
     return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, diagonal, train)
-
-
-def _inverses(curvatures: np.ndarray) -> np.ndarray:
-    """Return the inverses [n, 3, 3] of H from its sums over the views."""
-    prior = _PRIOR * np.trace(curvatures, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
-    return np.linalg.inv(curvatures + prior[:, None, None] * np.eye(3))
-
-
-def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return sums of the parts [V, n] of Gaussians over groups: Gaussians with the same nearest
-    centre form one.
-    """
-    if not len(means):
-        return parts
-    _, labels = KDTree(means[::_GROUP]).query(means)
-    return np.stack([np.bincount(labels, row) for row in parts])
 
 
 def blurred(image: np.ndarray, blur: float) -> np.ndarray:

@@ -38,7 +38,9 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.features import detect, intersect, join_matches, match_views
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Steps
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import scene_extent, seen_points
 from morgs_mi.fit.first_frame import fit_first_frame
@@ -117,20 +119,15 @@ class Refinement:
             f"withheld pixels have {self.refined_psnr:.2f} dB instead of "
             f"{self.calibrated_psnr:.2f} dB"
         )
-        if np.isnan(self.calibrated_psnr):
-            return f"The cameras were refined, {self._sizes}."
-        if self.taken:
-            return f"The cameras were refined, {self._sizes}: {scores}."
-        return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
-
-    @property
-    def _sizes(self) -> str:
-        """The sizes of the changes in words."""
-        return (
+        if not self.taken:
+            return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
+        sizes = (
             f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, "
             f"{100 * self.focal:.2g} % of the focal length and {100 * self.distortion:.2g} % of "
             "the image's width by the lens"
         )
+        reason = "" if np.isnan(self.calibrated_psnr) else f": {scores}"
+        return f"The cameras were refined, {sizes}{reason}."
 
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
@@ -176,7 +173,7 @@ def refine_cameras(
     config: FitConfig,
     render: RenderConfig | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
 ) -> tuple[Capture, Refinement]:
     """Return the capture with refined training cameras and moved points, if these are better, and
     the result.
@@ -232,11 +229,9 @@ class _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
         images = next(capture.displayed().partial_frames(0, 1)).images
         train = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
-        if len(train) < 2:
-            raise ValueError(
-                "refine_cameras(): expected images of at least two training views, got "
-                f"{len(train)}; record more, or set `refine_cameras` to off."
-            )
+        requirement = "expected images of at least two training views"
+        remedy = "record more, or set `refine_cameras` to off"
+        require(len(train) > 1, "refine_cameras()", requirement, len(train), remedy)
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in train.values()])
@@ -295,9 +290,7 @@ class _Problem:
         """
         shifts = []
         for camera, change in zip(self.cameras, changes, strict=True):
-            corners = np.array(
-                [(x, y) for x in (0, camera.width) for y in (0, camera.height)], float
-            )
+            corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * (camera.width, camera.height)
             moved_corners = distorted(camera, corners, change[9:])
             shifts.append(float(_largest_norm(moved_corners - corners) / camera.width))
         return (
@@ -309,15 +302,12 @@ class _Problem:
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
-        rows = dict(zip(self.indices, changes, strict=True))
-        cameras = [
-            changed_camera(camera, rows[v]) if v in rows else camera
-            for v, camera in enumerate(self.capture.cameras)
-        ]
-        distortions = [
-            rows[v][9:].tolist() if v in rows else (0.0, 0.0) for v in range(len(cameras))
-        ]
-        rig = self.capture.with_cameras(cameras, distortions)
+        rows = np.zeros((len(self.capture.cameras), CHANGES))
+        rows[list(self.indices)] = changes
+        cameras = list(self.capture.cameras)
+        for v in self.indices:
+            cameras[v] = changed_camera(cameras[v], rows[v])
+        rig = self.capture.with_cameras(cameras, rows[:, 9:].tolist())
         return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:

@@ -19,11 +19,10 @@ frame. The errors of the offsets are divided by the part of this move that the e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -31,7 +30,9 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Steps
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
@@ -92,7 +93,7 @@ class TimeOffsets:
 
 def estimate_time_offsets(
     capture: Capture,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
     seed: int = 0,
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
@@ -113,15 +114,13 @@ def estimate_time_offsets(
         ValueError: the recording has one camera or fewer than four frames, an image is missing, or
             nothing moves.
     """
-    if len(capture.cameras) < 2:
-        raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
+    place = str(capture.path)
+    cameras = len(capture.cameras)
+    require(cameras > 1, place, "expected at least 2 cameras to compare clocks", 1, "record more")
     clips = _Clips.of(capture)
     largest = min(_LARGEST, (clips.num_frames - 2) // 2)
-    if largest < 1:
-        raise ValueError(
-            f"{clips.path}: expected at least 4 frames to compare clocks, got "
-            f"{clips.num_frames}; record longer."
-        )
+    requirement = "expected at least 4 frames to compare clocks"
+    require(largest >= 1, place, requirement, clips.num_frames, "record longer")
     last = clips.num_frames - 2 - largest
     timestamps = np.linspace(largest, last, _TIMESTAMPS).round().astype(int)
     rounds = _Rounds(clips, timestamps, seed, progress)
@@ -193,7 +192,7 @@ class _Rounds:
     clips: _Clips  # images to fit
     timestamps: np.ndarray  # frames at which Gaussians are fitted
     seed: int  # seed of all fits
-    progress: Callable[[int, int], None] | None  # called with (fits done, fits at most), or None
+    progress: Steps | None  # called with (fits done, fits at most), or None
     done: int = 0  # number of completed fits
 
     def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
@@ -208,11 +207,9 @@ class _Rounds:
                 # There are fewer fits if a round is left out.
                 self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.timestamps))
         equations = reduce(add, parts)
-        if not equations.own.any():
-            raise ValueError(
-                f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, "
-                "found none; record something that moves."
-            )
+        place = str(self.clips.capture.path)
+        requirement = f"expected motion in the first {self.clips.num_frames} frames"
+        require(equations.own.any(), place, requirement, "none", "record something that moves")
         return equations
 
 
@@ -220,13 +217,10 @@ class _Rounds:
 class _Clips:
     """The first frames of a capture, reduced."""
 
-    path: Path  # folder of the capture
+    capture: Capture
     cameras: tuple[Camera, ...]  # V views
     masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
     images: list[list[np.ndarray]]  # per view and frame uint8 [H, W, 3]
-    train: list[int]  # indices of the training views
-    points: np.ndarray  # [P, 3], world units
-    point_colors: np.ndarray  # [P, 3] in [0, 1]
 
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
@@ -246,15 +240,12 @@ class _Clips:
         for clip, camera in zip(clips, cameras, strict=True):
             size = (camera.width, camera.height)
             images.append([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in clip])
-        return cls(
-            capture.path,
-            cameras,
-            masks,
-            images,
-            list(capture.train_views),
-            capture.points,
-            capture.point_colors,
-        )
+        return cls(capture, cameras, masks, images)
+
+    @property
+    def train(self) -> list[int]:
+        """Indices of the training views."""
+        return list(self.capture.train_views)
 
     @property
     def num_frames(self) -> int:
@@ -305,6 +296,6 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
     )
     views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
     rng = rng_of(seed, Stream.TIMING)
-    points = (clips.points, clips.point_colors)
+    points = (clips.capture.points, clips.capture.point_colors)
     problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
     return fit_first_frame(problem, fit, rng).gaussians

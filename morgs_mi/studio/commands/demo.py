@@ -65,24 +65,24 @@ class Demo:
         with progress() as report:
             result = run_demo(self.out, config, report)
         # A row for each fit: its mean scores over the frames that both have.
-        frames = result.compared_frames
+        frames = result["comparison"]["frames"]
         table = Table(
             title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}"
         )
         for column in ("", *(title for title, _ in _SCORES.values())):
             table.add_column(column, justify="right" if column else "left")
         for name, title in (("full", "with motion"), ("plain", "without")):
-            row = result.comparison[name]
+            row = result["comparison"][name]
             cells = (figure(row[key], digits) for key, (_, digits) in _SCORES.items())
             table.add_row(title, *cells)
         print_table(table)
-        full = result.full
+        full = result["full"]
         print_result(
-            f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
-            f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "
-            f"{figure(full.seconds.per_later_frame, 1)} s and "
-            f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
-            f"{result.seconds['total']:.0f} s in all."
+            f"Held-out PSNR {figure(full['psnr']['first'], 2)} dB in the first frame, "
+            f"{figure(full['psnr']['last'], 2)} dB in the last of {full['num_frames']}; "
+            f"{figure(full['seconds']['per_later_frame'], 1)} s and "
+            f"{figure(full['bytes']['per_residual'] / 1e6, 2)} MB per later frame; "
+            f"{result['seconds']['total']:.0f} s in all."
         )
         print_result(
             f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, "

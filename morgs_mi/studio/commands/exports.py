@@ -32,8 +32,7 @@ class Gltf(ExportKind):
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.codec.frame_source import play
         from morgs_mi.playback.export.clips import select_frames, write_each
-        from morgs_mi.studio.exports.axes import gltf_axes
-        from morgs_mi.studio.exports.gltf_export import write_gltf
+        from morgs_mi.studio.exports.gltf_export import gltf_axes, write_gltf
 
         frames = select_frames(stream, self.frames)
         write = partial(write_gltf, axes=gltf_axes(stream.cameras))

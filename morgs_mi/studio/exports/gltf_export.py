@@ -19,15 +19,19 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
+from morgs_mi.core.rig import up_direction
 
 _NAME = "KHR_gaussian_splatting"
 _FLOAT = 5126
@@ -62,11 +66,9 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     Raises:
         ValueError: as for `write_gltf`.
     """
-    if not len(gaussians):  # an accessor must have at least one element
-        raise ValueError(
-            "write_gltf(): at least one Gaussian was expected, got none; glTF cannot hold an "
-            "empty set."
-        )
+    # An accessor must have at least one element.
+    remedy = "glTF cannot hold an empty set"
+    require(len(gaussians), "write_gltf()", "at least one Gaussian was expected", "none", remedy)
     columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
     binary = b"".join(column.tobytes() for column in columns.values())
     node: dict[str, Any] = {"mesh": 0}
@@ -114,17 +116,14 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     document = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     document += b" " * (-len(document) % 4)
     size = 12 + 8 + len(document) + 8 + len(binary)
-    if size >= 2**32:
-        raise ValueError(
-            f"write_gltf(): {len(gaussians)} Gaussians take {size} bytes, a .glb file holds 2^32; "
-            "use PLY."
-        )
+    got = f"{size} of {len(gaussians)} Gaussians"
+    require(size < 2**32, "write_gltf()", "expected less than 2^32 bytes", got, "use PLY")
     head = struct.pack("<4sII", b"glTF", 2, size)
-    return head + _chunk(b"JSON", document) + _chunk(b"BIN\0", binary)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack("<I4s", len(data), kind) + data
+    chunks = (
+        struct.pack("<I4s", len(data), kind) + data
+        for kind, data in ((b"JSON", document), (b"BIN\0", binary))
+    )
+    return head + b"".join(chunks)
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -147,3 +146,16 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         "COLOR_0": np.concatenate([color, alpha], axis=1),
     }
     return {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
+
+
+def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the rotation [3, 3] from world to glTF axes: y is the cameras' mean up, x nearly the
+    first one's right.
+    """
+    up = up_direction(cameras)
+    views = np.asarray(cameras[0].viewmat, np.float64)
+    right, forward = (side - (side @ up) * up for side in (views[0, :3], views[2, :3]))
+    if np.linalg.norm(right) < 0.5:  # the camera is rolled by 90 degrees: its right is nearly up
+        right = forward
+    right /= np.linalg.norm(right)
+    return np.stack([right, up, np.cross(right, up)])

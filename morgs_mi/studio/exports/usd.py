@@ -30,7 +30,7 @@ renderer rotates the harmonics with a prim. The unit of a capture is unknown; `m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -42,12 +42,14 @@ import numpy as np
 from scipy.special import expit
 
 from morgs_mi.codec.frame_source import FrameSource, FrameState
+from morgs_mi.core.checks import require
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
+from morgs_mi.core.progress import Steps
 from morgs_mi.playback.export.formats import USD, choose_format
 from morgs_mi.playback.stream_header import stream_origin
-from morgs_mi.studio.exports.axes import gltf_axes
+from morgs_mi.studio.exports.gltf_export import gltf_axes
 
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 _DEGREE = "radiance:sphericalHarmonicsDegree"
@@ -59,10 +61,12 @@ _TYPES = {
     "scales": ("Vec3fArray", "Vec3hArray"),
     "opacities": ("FloatArray", "HalfArray"),
     _COEFFICIENTS: ("Vec3fArray", "Vec3hArray"),
+    "extent": ("Vec3fArray", None),
 }
 _LARGEST_HALF = 65504.0
 _EXTENT_SIGMAS = 3.0
 UNSAVED_BYTES = 2**28  # of samples in memory
+_INSTALL = "install it with pip install 'morgs-mi[usd]'"
 
 
 def write_usd(
@@ -70,7 +74,7 @@ def write_usd(
     path: str | Path,
     frames: Sequence[int],
     half: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
 ) -> None:
     """Write frames of a stream as an OpenUSD stage; the file is written atomically. See the module
     for its content.
@@ -115,7 +119,7 @@ def _write_stage(
     path: Path,
     frames: Sequence[int],
     half: bool,
-    progress: Callable[[int, int], None] | None,
+    progress: Steps | None,
 ) -> None:
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
     axes = gltf_axes(stream.cameras)
@@ -167,7 +171,7 @@ def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
     sets = {}
     for first_id, parts in parts_of.items():
         ids = np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)])
-        names = _TYPES if parts else ()
+        names = parts[0][1] if parts else ()
         births = {name: np.concatenate([values[name] for _, values in parts]) for name in names}
         sets[first_id] = _Set(*starts[first_id], ids, births)
     return sets
@@ -194,10 +198,12 @@ class _Field:
     def __init__(self, pxr: Any, prim: Any, gaussians: _Set, half: bool) -> None:
         self._ids = gaussians.ids
         self._state = {name: value.copy() for name, value in gaussians.births.items()}
-        self._samples = {
-            "extent": _Samples(prim.GetAttribute("extent"), pxr.Vt.Vec3fArray, np.float32)
-        }
-        self._samples |= {name: _samples(pxr, prim, name, half) for name in _TYPES}
+        self._samples = {}
+        for name, types in _TYPES.items():
+            is_half = half and types[1] is not None
+            attribute = prim.GetAttribute(f"{name}h" if is_half else name)
+            array = getattr(pxr.Vt, types[is_half])
+            self._samples[name] = _Samples(attribute, array, np.float16 if is_half else np.float32)
 
     def put(self, state: FrameState, axes: np.ndarray) -> int:
         """Write a frame and return the number of bytes of its samples."""
@@ -243,14 +249,6 @@ class _Samples:
             rows = np.clip(rows, -_LARGEST_HALF, _LARGEST_HALF)
         rows = np.ascontiguousarray(rows, self.dtype)
         self.attribute.Set(self.array.FromNumpy(rows), time)
-
-
-def _samples(pxr: Any, prim: Any, name: str, half: bool) -> _Samples:
-    """Return the time samples of an attribute, in half precision if it can have it."""
-    full, small = _TYPES[name]
-    if half and small is not None:
-        return _Samples(prim.GetAttribute(f"{name}h"), getattr(pxr.Vt, small), np.float16)
-    return _Samples(prim.GetAttribute(name), getattr(pxr.Vt, full), np.float32)
 
 
 def _extent(gaussians: Gaussians) -> np.ndarray:
@@ -322,13 +320,9 @@ def _pxr() -> Any:
         modules = SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in names})
     except ImportError as error:
         raise ValueError(
-            "write_usd(): expected the package usd-core, found none; install it with pip install "
-            "'morgs-mi[usd]'."
+            f"write_usd(): expected the package usd-core, found none; {_INSTALL}."
         ) from error
-    if not hasattr(modules.UsdVol, "ParticleField3DGaussianSplat"):
-        version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
-        raise ValueError(
-            f"write_usd(): expected OpenUSD 26.3 or newer, got {version}; install it with pip "
-            "install 'morgs-mi[usd]'."
-        )
+    version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
+    has_schema = hasattr(modules.UsdVol, "ParticleField3DGaussianSplat")
+    require(has_schema, "write_usd()", "expected OpenUSD 26.3 or newer", version, _INSTALL)
     return modules

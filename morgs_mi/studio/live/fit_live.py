@@ -269,7 +269,7 @@ def _fit(
 ) -> list[LiveFrame]:
     """Fit live frames into a locked folder."""
     capture = frames.capture
-    train = frames.capture.train_views
+    train = capture.train_views
     metadata = stream_metadata(capture, next(capture.partial_frames()), config)
     del metadata["num_frames"]  # not known yet
     prepared = Prepared.of(capture, config, Progress(on_stage))

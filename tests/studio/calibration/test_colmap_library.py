@@ -10,7 +10,7 @@ import morgs_mi
 
 SCRIPT = """
 import signal, time
-from morgs_mi.studio.calibration.colmap_library import import_pycolmap
+from morgs_mi.studio.calibration.calibrate import import_pycolmap
 from morgs_mi.core.interrupts import interruptible
 
 with interruptible():

@@ -13,8 +13,7 @@ import pytest
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.studio.exports.axes import gltf_axes
-from morgs_mi.studio.exports.gltf_export import glb, write_gltf
+from morgs_mi.studio.exports.gltf_export import glb, gltf_axes, write_gltf
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, splats
 

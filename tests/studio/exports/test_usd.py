@@ -18,7 +18,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.playback.export.formats import USD
-from morgs_mi.studio.exports.axes import gltf_axes
+from morgs_mi.studio.exports.gltf_export import gltf_axes
 from morgs_mi.studio.exports.usd import write_usd
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, splats, write_stream

@@ -76,12 +76,14 @@ def draw_rig(
         (camera.name or str(view), _MARKED if view in test_views else _USUAL)
         for view, camera in enumerate(cameras)
     ]
-    above, side = figure.subplots(1, 2)
-    _label(above, "From above", "right, world units", "forward, world units")
-    _label(side, "From the right", "forward, world units", "up, world units")
-    for axes, plane in ((above, np.stack([right, forward])), (side, np.stack([forward, up]))):
-        _draw_projection(axes, plane, frusta, labels, *cloud)
-        _draw_world_axes(axes, plane)
+    panels = (
+        ("From above", "right", "forward", [right, forward]),
+        ("From the right", "forward", "up", [forward, up]),
+    )
+    for axes, (title, x, y, plane) in zip(figure.subplots(1, 2), panels, strict=True):
+        axes.set_title(title, fontsize=11, loc="left")
+        axes.set(xlabel=f"{x}, world units", ylabel=f"{y}, world units")
+        _draw_projection(axes, np.stack(plane), frusta, labels, *cloud)
 
 
 def _draw_projection(
@@ -105,6 +107,18 @@ def _draw_projection(
     xlim, ylim = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
     axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
     axes.grid(color="0.9")
+    # The world's axes in the corner of the panel.
+    for name, color, direction in zip("xyz", _AXIS_COLORS, plane.T, strict=True):
+        if np.linalg.norm(direction) > 0.4:
+            axes.annotate(
+                name,
+                (0.12, 0.12),
+                xycoords="axes fraction",
+                xytext=36 * direction,
+                textcoords="offset points",
+                color=color,
+                arrowprops={"arrowstyle": "<-", "color": color},
+            )
 
 
 def _around_middle(
@@ -127,21 +141,6 @@ def _around_middle(
     return np.array(frusta) - middle, places[near] - middle, colors[near]
 
 
-def _draw_world_axes(axes: Any, plane: np.ndarray) -> None:
-    """Draw the world's axes in the corner of a panel that shows a plane [2, 3]."""
-    for name, color, direction in zip("xyz", _AXIS_COLORS, plane.T, strict=True):
-        if np.linalg.norm(direction) > 0.4:
-            axes.annotate(
-                name,
-                (0.12, 0.12),
-                xycoords="axes fraction",
-                xytext=36 * direction,
-                textcoords="offset points",
-                color=color,
-                arrowprops={"arrowstyle": "<-", "color": color},
-            )
-
-
 def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
     up = up_direction(cameras)
@@ -152,9 +151,3 @@ def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     level = candidates - np.outer(candidates @ up, up)
     forward = next(vector / length for vector in level if (length := np.linalg.norm(vector)) > 1e-3)
     return np.stack([np.cross(forward, up), forward, up])
-
-
-def _label(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
-    """Set the title and the labels of a panel."""
-    axes.set_title(title, fontsize=11, loc="left")
-    axes.set(xlabel=xlabel, ylabel=ylabel)

@@ -91,7 +91,13 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
     if correction:
         cameras, explanation = correction
-        checks = _checks_of_mistake(pairs, cameras)
+        # The views with another corrected camera are wrong.
+        views = range(len(cameras))
+        culprits = {view for view in views if cameras[view] is not pairs.cameras[view]}
+        checks = [_check(view, pairs, set(views) - culprits) for view in views]
+        for view in culprits:
+            if checks[view].matches:
+                checks[view] = replace(checks[view], fits=False, advice="")
         advice = f"the poses do not fit the images: {explanation}."
     else:
         checks = [
@@ -103,19 +109,17 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
         wrong = ", ".join(c.name for c in checks if c.fits is False)
         not_checked = ", ".join(c.name for c in checks if c.fits is None)
         count = sum(c.fits is True for c in checks)
-        advice = "the poses fit the images"
+        rest = f"; not checked: {not_checked}" if not_checked else ""
         if wrong:
-            advice = f"the poses of {wrong} do not fit the images"
+            advice = f"the poses of {wrong} do not fit the images{rest}."
         elif not count:
             advice = (
                 "too few matches to check the poses: the views have little overlap, or the scene "
-                "has little texture"
+                "has little texture."
             )
-        elif not_checked:
-            advice = f"the poses of {count} of {len(checks)} cameras fit the images"
-        if not_checked and (wrong or count):
-            advice += f"; not checked: {not_checked}"
-        advice += "."
+        else:
+            some = f" of {count} of {len(checks)} cameras" if not_checked else ""
+            advice = f"the poses{some} fit the images{rest}."
     verdicts = [check.fits for check in checks]
     fits = False if False in verdicts else None if None in verdicts else True
     return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
@@ -139,17 +143,6 @@ def pose_problems(views: Sequence[View]) -> list[str]:
     capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
     check = check_rig(capture, SharedFeatures(features, tuple(match_views(features, cameras))))
     return [check.advice] if check.fits is False else []
-
-
-def _checks_of_mistake(pairs: _Pairs, corrected: Sequence[Camera]) -> list[CameraCheck]:
-    """Return the result of each view if the views with another corrected camera are wrong."""
-    views = range(len(corrected))
-    culprits = {view for view in views if corrected[view] is not pairs.cameras[view]}
-    checks = [_check(view, pairs, set(views) - culprits) for view in views]
-    return [
-        replace(c, fits=False, advice="") if view in culprits and c.matches else c
-        for view, c in enumerate(checks)
-    ]
 
 
 def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:

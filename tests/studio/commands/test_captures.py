@@ -15,7 +15,7 @@ import pytest
 from morgs_mi.capture.capture import Capture
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.studio.calibration.timing import TimeOffsets
-from morgs_mi.studio.commands import info
+from morgs_mi.studio.commands import captures as info
 from tests.cli.commands import assert_refused
 from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
 

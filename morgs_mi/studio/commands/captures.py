@@ -1,4 +1,4 @@
-"""`morgs-mi info`: the contents of a capture."""
+"""`morgs-mi info` and `calibrate`: the contents of a capture, and camera poses from its images."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from typing import Annotated, ClassVar
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.points import match_capture, triangulate_points
-from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
+from morgs_mi.cli.console import print_result, print_table, print_warning, progress
+from morgs_mi.cli.settings import Flag, GivenReading, Reading, Without, optional
 from morgs_mi.core.plots import check_plot
 from morgs_mi.fit.forecast import forecast
+from morgs_mi.studio.calibration.calibrate import CalibrateConfig
 from morgs_mi.studio.calibration.checks.plots import write_rig
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.studio.calibration.timing import TimeOffsets, estimate_time_offsets
@@ -85,7 +86,7 @@ class Info:
                 f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} "
                 f"pairs; {rig_check.advice}"
             )
-            for line in advice_lines(rig_check.cameras):
+            for line in _advice_lines(rig_check.cameras):
                 print_result(line)
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
@@ -102,9 +103,48 @@ class Info:
             print_result(f"Plot of the rig: {self.plot}")
 
 
+@dataclass(frozen=True)
+class Calibrate:
+    """Calibrate the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
+
+    folder: Positional[Path]
+    """Folder of videos, or of one folder of images per camera."""
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(
+        default_factory=CalibrateConfig
+    )
+    without: Without = ()
+    """Cameras that are left out, by name."""
+    overwrite: Flag = False
+    """Replace an earlier model in FOLDER/sparse."""
+
+    def run(self) -> None:
+        from morgs_mi.studio.calibration.calibrate import calibrate
+
+        with progress() as report:
+            result = calibrate(
+                self.folder,
+                self.config,
+                self.overwrite,
+                lambda *stage: report(*stage),
+                self.without,
+            )
+        table = _check_table(str(result.model), ("camera", "points", "error, px", "pose"))
+        for check in result.checks:
+            table.add_row(check.name, *_check_cells(check))
+        print_table(table)
+        for line in _advice_lines(result.checks):
+            print_warning(line)
+        points = ", with a principal point for each" if result.principal_points else ""
+        print_result(
+            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
+            f"reprojection error {result.error:.2f} px, by {result.mapper} mapping{points}; scale "
+            "and up direction of its world are arbitrary."
+        )
+
+
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
     """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
-    table = check_table(f"{capture.path}: {capture.layout}", ("", "camera", *_COLUMNS))
+    table = _check_table(f"{capture.path}: {capture.layout}", ("", "camera", *_COLUMNS))
     for index, camera in enumerate(capture.cameras):
         K = camera.K
         fx = f"{K[0, 0]:.1f}"
@@ -118,7 +158,7 @@ def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
             f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
             "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
             "test" if index in capture.test_views else "train",
-            *check_cells(rig_check.cameras[index] if rig_check else None),
+            *_check_cells(rig_check.cameras[index] if rig_check else None),
         )
     return table
 
@@ -149,7 +189,7 @@ def _time_lines(offsets: TimeOffsets) -> list[str]:
     return lines
 
 
-def check_table(title: str, columns: Sequence[str]) -> Table:
+def _check_table(title: str, columns: Sequence[str]) -> Table:
     """Return a table without rows, whose cells are not wrapped."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in columns:
@@ -157,14 +197,14 @@ def check_table(title: str, columns: Sequence[str]) -> Table:
     return table
 
 
-def check_cells(check: CameraCheck | None) -> tuple[str, str, str]:
+def _check_cells(check: CameraCheck | None) -> tuple[str, str, str]:
     """Return the number of matches, the error and the verdict of a camera as text."""
     if check is None:
         return "-", "-", "not checked"
     return str(check.matches), f"{check.error:.2f}" if check.matches else "-", check.verdict
 
 
-def advice_lines(checks: Sequence[CameraCheck]) -> list[str]:
+def _advice_lines(checks: Sequence[CameraCheck]) -> list[str]:
     """Return a sentence per advice, with the names of the cameras that it concerns."""
     names: dict[str, list[str]] = {}
     for check in checks:
