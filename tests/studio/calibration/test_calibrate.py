@@ -195,7 +195,7 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
     with pytest.raises(
         ValueError,
-        match=r"to register all 5 cameras, got 4, without other: .* or accept the partial model",
+        match=r"to register all 5 cameras, got 4, without other; .* or accept the partial model",
     ):
         calibrate(tmp_path)
     assert not (tmp_path / "sparse").exists()
