@@ -490,16 +490,15 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
 
 @pytest.mark.slow
 def test_push__skipping_static_views_costs_no_quality(clip):
-    """The held-out image is as good in the mean of three seeds, in fewer bytes."""
-    some = QUICK
-    quality = np.zeros((3, 2))
-    sizes = np.zeros((3, 2))
-    for seed in range(3):
-        begun = new_loop(dataclasses.replace(some, seed=seed))
+    """The held-out image is as good in the mean of eight seeds, in fewer bytes."""
+    quality = np.zeros((8, 2))
+    sizes = np.zeros((8, 2))
+    for seed in range(8):
+        begun = new_loop(dataclasses.replace(QUICK, seed=seed))
         begun.push(clip[0][:4])
         for column, skip in enumerate((True, False)):
             fit = dataclasses.replace(QUICK.fit, skip_static=skip)
-            loop = new_loop(dataclasses.replace(some, fit=fit, seed=seed))
+            loop = new_loop(dataclasses.replace(QUICK, fit=fit, seed=seed))
             loop.state = begun.state  # the first frame skips nothing
             reports = [loop.push(images[:4])[1] for images in clip[1:3]]
             image = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
@@ -508,6 +507,7 @@ def test_push__skipping_static_views_costs_no_quality(clip):
             assert (reports[-1].active["pixels"] < 1) == skip
     # One seed differs by up to a decibel: five small views, and a first frame that is far from
     # done.
+    print(quality)
     assert quality[:, 0].mean() > quality[:, 1].mean() - 0.3
     assert np.all(sizes[:, 0] < 0.9 * sizes[:, 1])
 

@@ -36,7 +36,8 @@ def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
         run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without."
     )
     assert_refused(
-        run("fit", capture, tmp_path / "out", *OPTIONS), "use the first frames with --frames 3,"
+        run("fit", capture, tmp_path / "out", *OPTIONS),
+        "rames 3, those that all clips cover with --trim",
     )
     (capture / "cam2.mkv").write_bytes(b"")
     status, out, _ = run("info", capture, "--without", "cam2")

@@ -174,12 +174,12 @@ CASES = {
     "PLY of many vertices": (
         read_vertices,
         ply(BINARY + LARGE),
-        "99999999999 vertex need at least 399999999996 bytes",
+        "99999999999 vertex need 399999999996 bytes",
     ),
     "text PLY of many vertices": (
         read_vertices,
         ply("format ascii 1.0\n" + LARGE, b"1\n"),
-        "at least .* 2 follow",
+        "need .* bytes, 2 follow",
     ),
     "PLY of negative size": (
         read_vertices,
@@ -199,7 +199,7 @@ CASES = {
             + LARGE.replace(" x", " packed_position"),
             bytes(4),
         ),
-        "99999999999 vertex need at least 399999999996 bytes, 0 follow",
+        "99999999999 vertex need 399999999996 bytes, 0 follow",
     ),
     "compressed PLY of empty rows": (
         read_splats,

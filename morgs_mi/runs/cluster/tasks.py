@@ -22,6 +22,7 @@ import numpy as np
 from annotated_types import Ge
 
 from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
+from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.codec.container import Packet, decode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.core.camera import Camera
@@ -182,7 +183,7 @@ def fit_frames(fit: Fit, chunk: Chunk, stop: int) -> Part:
             last_state = loop.state.coded
             packet, report = push_frame(loop, frame, capture.train_views, None, upcoming)
             packets += [packet, *due_keyframe(loop.state.coded, fit.config.codec.keyframe_interval)]
-            reports.append(report)
+            reports.append(replace(report, fingerprints=image_fingerprints(frame.images)))
             restart = restart_of(last_state, packet)
         chunk = replace(chunk, frame=stop, restart=restart)
         _OPEN[repr(fit), chunk] = loop, capture, recorded
