@@ -507,7 +507,6 @@ def test_push__skipping_static_views_costs_no_quality(clip):
             assert (reports[-1].active["pixels"] < 1) == skip
     # One seed differs by up to a decibel: five small views, and a first frame that is far from
     # done.
-    print(quality)
     assert quality[:, 0].mean() > quality[:, 1].mean() - 0.3
     assert np.all(sizes[:, 0] < 0.9 * sizes[:, 1])
 
