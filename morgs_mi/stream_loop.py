@@ -305,8 +305,8 @@ class StreamLoop:
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
         memory = process_memory()
-        # A frame with more active Gaussians than all before takes buffers of another size; those of
-        # the first frame are not used again.
+        # Buffers for more active Gaussians have a new size, and the smaller ones stay allocated.
+        # The buffers of the first frame are not used again.
         if memory.get("resident", 0) > _GROWTH * self._resident:
             self._resident = memory["resident"] if frame else 0
             release_memory()

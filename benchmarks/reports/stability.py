@@ -5,7 +5,7 @@
 writes `benchmarks/results/stability.json`, and the tables and the plot of the page
 docs/experiments/stability.md.
 
-The cases are those of the tests (`tests.scenes.extremes`, `tests.scenes.hard_fits`). Image and
+The cases are shared with the tests (`tests.scenes.extremes`, `tests.scenes.hard_fits`). Image and
 gradients are compared with a reference in extended precision, a million Gaussians with
 `morgs_mi.evaluate.reference64`. A row has its `kind` and `name`, the errors of the image and of the
 gradient by attribute, the seconds of an image with its gradients after a warm-up, and the condition
@@ -57,7 +57,7 @@ class Options(Output):
     """Measure errors in stiff and extreme cases, against extended precision."""
 
     json: Path | None = RESULTS / "stability.json"
-    """JSON file for the rows; the committed one is that of the page, which is then written."""
+    """JSON file for the rows. For the committed file, the page is written as well."""
     plot: Path | None = PAGES / "stability.png"
     """Plot of the errors over condition numbers, .png or .svg; needs matplotlib."""
     frames: int = 300

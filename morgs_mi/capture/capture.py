@@ -449,7 +449,8 @@ def _at_clip_sizes(
         if abs(camera.width * height - camera.height * width) > min(camera.width, camera.height):
             raise ValueError(
                 f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of "
-                f"{camera.name}, or a scaled version of it, got {width}x{height}."
+                f"{camera.name}, or a scaled version of it, got {width}x{height}; calibrate at "
+                "the size of the images."
             )
         recorded.append(camera.resized(width, height))
     pairs = zip(cameras, recorded, strict=True)

@@ -44,7 +44,8 @@ def used_in_clip(
         rows, columns = mask.shape
         if abs(columns * height - rows * width) > min(columns, rows, width, height):
             raise ValueError(
-                f"{file}: expected a mask of {width}x{height}, or scaled, got {columns}x{rows}."
+                f"{file}: expected a mask of {width}x{height}, or scaled, got {columns}x{rows}; "
+                "draw it at the size of its images."
             )
         used_mask &= scaled_mask(mask, width, height)
     if not used_mask.all():

@@ -32,8 +32,8 @@ def reference64(
     weights: np.ndarray,
     config: RenderConfig,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the colours [P, 3] of some pixels over black (eq. 1), and the gradients by attribute
-    of the sum of `weights` times these colours.
+    """Return the colours [P, 3] of some pixels over black (eq. 1), display-referred, and the
+    gradients of the sum of `weights` times these colours, by attribute in its shape.
 
     Args:
         gaussians: N Gaussians; their motion and the delays of the camera are ignored.
@@ -42,7 +42,7 @@ def reference64(
         weights: [P, 3].
         config: `eps2d`, `antialiased`, `alpha_min` and `alpha_max` are used.
     """
-    types: Any = mi  # whose stubs lack those of double precision
+    types: Any = mi  # The stubs of Mitsuba lack the types of double precision.
     raw = gaussians.numpy()
     columns: dict[str, Any] = {
         name: [mi.Float64(column) for column in raw[name].reshape(len(gaussians), -1).T]

@@ -41,7 +41,10 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     """
     shapes = {name: np.shape(channel) for name, channel in channels.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
-        raise ValueError(f"write_exr(): `channels` must share one shape [H, W], got {shapes}.")
+        raise ValueError(
+            f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
+            "for each."
+        )
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path, "write_exr()") as partial:
@@ -78,7 +81,9 @@ def read_light(path: str | Path) -> np.ndarray:
     """
     channels, header = _read(path)
     if abs((aspect := header.get("pixelAspectRatio", 1)) - 1) > _SAME:
-        raise ValueError(f"{path}: expected square pixels, got the pixel aspect {aspect:g}.")
+        raise ValueError(
+            f"{path}: expected square pixels, got the pixel aspect {aspect:g}; resample the image."
+        )
     light = np.stack([channels[name] for name in _color_names(path, channels)], axis=-1)
     primaries = header.get("chromaticities", _REC_709)
     if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:

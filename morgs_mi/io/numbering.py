@@ -62,7 +62,8 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     for number, name in zip(best, names, strict=True):
         if last[number] != name:
             raise ValueError(
-                f"{folder}: expected one file of number {number}, got {name} and {last[number]}."
+                f"{folder}: expected one file of number {number}, got {name} and "
+                f"{last[number]}; remove one."
             )
     return list(best)
 

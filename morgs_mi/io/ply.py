@@ -9,8 +9,8 @@ axes stay as they are; the layout does not prescribe any.
 Mitsuba's shape `ellipsoids` reads this layout, and one with all attributes: it makes an attribute
 NAME of adjacent properties ``NAME_0``, ``NAME_1``, ... between ``nx ny nz`` and ``scale_0``. Their
 values are activated, as the integrators read them: opacities and confidence in [0, 1], and SH with
-coefficient k of colour component j at 3 k + j. Names and shapes are those of the table of
-attributes.
+coefficient k of colour component j at 3 k + j. The table of attributes has their
+names and shapes.
 """
 
 from __future__ import annotations
@@ -149,7 +149,8 @@ def read_ply(path: str | Path) -> Gaussians:
     count = len(sh_names) - 3
     if count not in SH_DEGREES or {*sh_order} != {*sh_names}:
         raise ValueError(
-            f"{path}: expected f_rest_0 to f_rest_8, 23, 44 or none, got {count} of them."
+            f"{path}: expected f_rest_0 to f_rest_8, 23, 44 or none, got {count} of them; "
+            "export it again."
         )
     if not is_mitsuba:
         attributes["logit_opacities"] = _table(vertices, ("opacity",))[:, 0]
@@ -213,7 +214,8 @@ def read_elements(
             return _read_properties(file, order, elements, names)
     except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise ValueError(
-            f"{path}: expected a complete PLY file, got one that cannot be read: {error}."
+            f"{path}: expected a complete PLY file, got one that cannot be read: {error}; copy or "
+            "export it again."
         ) from error
 
 

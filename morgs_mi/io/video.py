@@ -454,7 +454,8 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
             gap = int(np.argmax(steps))
             file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
             raise ValueError(
-                f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}."
+                f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
+                "remove or renumber it."
             )
         timestamps = range(numbers[0], numbers[-1] + 1, step)
         for folder, files in zip(group, clips, strict=True):
@@ -521,5 +522,7 @@ def decode_image(file: Path, mode: int) -> np.ndarray:
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     if image is None:
-        raise ValueError(f"{file}: expected an image, got {len(data)} bytes of another kind.")
+        raise ValueError(
+            f"{file}: expected an image, got {len(data)} bytes of another kind; copy it again."
+        )
     return image

@@ -85,7 +85,7 @@ def _balanced(
     setup: Setup, images: Images, progress: Progress
 ) -> tuple[tuple[Exposure, ...], dict[str, Any]]:
     """Return the exposures of all views by the balance of the cameras, empty if they are not
-    estimated, and the entry of the first frame's report; `images` are those of the first frame.
+    estimated, and the entry of the first frame's report, from the images of the first frame.
     """
     config = setup.config
     if config.fit.exposure == "off":

@@ -94,7 +94,8 @@ def in_order(cameras: Sequence[Camera], images: Any, frame: int) -> list[InputIm
     """Return the images of a frame in the cameras' order.
 
     Raises:
-        ValueError: there is not one image for each camera, or a name is not that of exactly one.
+        ValueError: the number of images differs from the number of cameras, or a name does not
+            belong to exactly one camera.
     """
     names = [camera.name for camera in cameras]
     if isinstance(images, Mapping) and all(names.count(name) == 1 for name in images):

@@ -1,4 +1,4 @@
-"""Cameras for Gaussians without a recording: those of their training, or a ring around them.
+"""Cameras for Gaussians without a recording: their training cameras, or a ring around them.
 
 Nothing in a `cameras.json` names its Gaussians. It may be of another scene in the same folder, or
 of the same scene before it was moved or scaled.

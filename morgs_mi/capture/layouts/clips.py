@@ -270,7 +270,8 @@ def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
     for file in files:
         if (other := files_by_stem.setdefault(file.stem, file)) != file:
             raise ValueError(
-                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}."
+                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; "
+                "move one away."
             )
     return files_by_stem
 

@@ -133,7 +133,8 @@ class _Bytes:
             yield
         if rest := len(self.data) - self.at:
             raise ValueError(
-                f"{self.path}: expected the {count} {what} it announces, got {rest} more bytes."
+                f"{self.path}: expected the {count} {what} it announces, got {rest} more bytes; "
+                "copy it again."
             )
 
     def take(self, record: str) -> tuple:

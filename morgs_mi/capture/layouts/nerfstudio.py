@@ -286,7 +286,10 @@ def _split(
     training = splits.get("train_filenames", set(range(len(names))) - held_out)
     views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
     if len(views) == len(images):
-        raise ValueError(f"{source}: expected a camera to train on, got none in the splits.")
+        raise ValueError(
+            f"{source}: expected a camera to train on, got none in the splits; add one to the "
+            "training split."
+        )
     calibration = replace(calibration, test_views=views)
     if extras := [calibration.names[view] for view in views if held_out.isdisjoint(images[view])]:
         _LOG.warning("%s: %s in none of the splits: left out.", source, ", ".join(extras))

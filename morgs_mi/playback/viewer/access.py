@@ -1,4 +1,4 @@
-"""Access to the viewer: who may connect, how often, and how long without progress.
+"""Access control of the viewer: hosts, tokens, and limits of connections and of idle time.
 
 A web page of another site can send requests to a server on this machine; browsers report it in
 `Origin` and `Sec-Fetch-Site` but do not prevent it. By DNS rebinding, such a page can also point

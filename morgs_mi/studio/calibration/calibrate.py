@@ -305,7 +305,10 @@ def _frames(
     short = [name for name, last in last_frames.items() if not 0 <= config.frame <= last]
     if short:
         names = ", ".join(short)
-        raise ValueError(f"{path}: frame {config.frame} is not in the clips of {names}.")
+        raise ValueError(
+            f"{path}: frame {config.frame} is not in the clips of {names}; choose another "
+            "one (--frame)."
+        )
     frames = {}
     for name, reader in readers.items():
         position = int(nearest_frames(reader, np.array([config.frame]))[0])
