@@ -130,14 +130,14 @@ def fit_first_frame(
             del gaussians  # tensors that the next steps would keep in memory
             select_rows(optimizer, plan.parent, plan.source < 0, plan.edits)
             start = start.select(plan.parent)
-        stretch = Steps(
+        chunk = Steps(
             islice(order, stop - first),
             first,
             rate_factor=lambda step: _FINAL_RATE ** (step / steps),
             on_step=None if progress is None else lambda count: progress(count, steps),
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )
-        losses = optimise(optimizer, rates, losses_at, stretch)
+        losses = optimise(optimizer, rates, losses_at, chunk)
     return FirstFrame(start.with_parameters(values_of(optimizer)), losses, steps)
 
 

@@ -21,7 +21,7 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import bounded, check_number, numbers
-from morgs_mi.core.config import apply_values
+from morgs_mi.core.config import Config, apply_values, types_of
 from morgs_mi.core.fit_names import CAPTURE, STREAM
 from morgs_mi.render.render_config import RenderConfig
 
@@ -88,10 +88,16 @@ def render_config(stream: FrameSource) -> RenderConfig:
     """Return the renderer settings of the fit.
 
     Raises:
-        ValueError: the stream's header has settings of other names, types or ranges.
+        ValueError: the stream's header has settings of other types or ranges.
     """
-    values = metadata_entry(stream, "config.render", {}, dict)
-    return apply_values(RenderConfig(), values, _place(stream, "config.render"))
+    return _stored_config(stream, "config.render", RenderConfig())
+
+
+def _stored_config(stream: FrameSource, key: str, default: Config) -> Config:
+    """Return the settings of a header under a key; older streams have some that went."""
+    values = metadata_entry(stream, key, {}, dict)
+    known = {name: values[name] for name in types_of(type(default)).keys() & values}
+    return apply_values(default, known, _place(stream, key))
 
 
 def stream_exposure(stream: FrameSource) -> float:
@@ -195,10 +201,7 @@ def open_stream_capture(
             capture is not the one that was fitted, or there are no frames.
     """
     path = capture or fitted_capture(stream)
-    values = metadata_entry(stream, "reading", {}, dict)
-    # Older streams have settings that went.
-    values = {key: values[key] for key in ReadConfig.__dataclass_fields__.keys() & values}
-    reading = apply_values(ReadConfig(), values, _place(stream, "reading"))
+    reading = _stored_config(stream, "reading", ReadConfig())
     downscale = metadata_entry(stream, "downscale", 1, int, float)
     test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
     mark = metadata_entry(stream, "fingerprint", None, str, NoneType)  # imported streams have none

@@ -329,10 +329,6 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
     old_metadata = {
         name: value for name, value in stream.metadata.items() if name not in excluded_names
     }
-    match old_metadata:
-        case {"config": {"fit": {"dropping": dropout} as fit} as config}:  # its earlier name
-            fit = {name: value for name, value in fit.items() if name != "dropping"}
-            old_metadata["config"] = {**config, "fit": {**fit, "dropout": dropout}}
     old = json.loads(header_json(stream.cameras, stream.fps, old_metadata))
     new = json.loads(header_json(cameras, capture.fps, metadata))
     if difference := _difference(old, new):

@@ -68,6 +68,14 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
     assert "confidence" not in next(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0]))[1]
 
 
+@pytest.mark.parametrize("name", ["walk4", "spheres"])
+def test_render_config__ignores_settings_that_went(name) -> None:
+    """The streams of the gallery have `reproducible` in their headers."""
+    stream = open_stream(Path(__file__).parents[2] / f"docs/gallery/{name}.morgs")
+    assert "reproducible" in stream.metadata["config"]["render"]
+    assert render_config(stream) == RenderConfig()
+
+
 @pytest.mark.parametrize(
     ("metadata", "read", "message"),
     [
@@ -77,9 +85,9 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
             r"`config.render` of the header's metadata must be an object, got None",
         ),
         (
-            {"config": {"render": {"x": 1}}},
+            {"config": {"render": {"alpha_min": "x"}}},
             render_config,
-            r"`config.render` of the header's metadata: `x` is unknown",
+            r"`config.render` of the header's metadata: `alpha_min` must be .* got 'x'",
         ),
         (
             {"config": {"motion": 1}},
