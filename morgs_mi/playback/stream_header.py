@@ -96,8 +96,8 @@ def render_config(stream: FrameSource) -> RenderConfig:
 def _stored_config(stream: FrameSource, key: str, default: Config) -> Config:
     """Return the settings of a header under a key; older streams have some that went."""
     values = metadata_entry(stream, key, {}, dict)
-    known = {name: values[name] for name in types_of(type(default)).keys() & values}
-    return apply_values(default, known, _place(stream, key))
+    settings = {name: values[name] for name in types_of(type(default)).keys() & values}
+    return apply_values(default, settings, _place(stream, key))
 
 
 def stream_exposure(stream: FrameSource) -> float:
