@@ -10,7 +10,6 @@ from benchmarks.pages.results import committed
 from benchmarks.reports import (
     cameras,
     codec,
-    drift,
     field,
     held_out,
     random_scenes,
@@ -171,7 +170,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "clocks": partial(study_table, timing, "timing"),
     "codec": lambda: codec.quality_table(committed("codec_report")["clips"]),
     "demo": demo,
-    "drift": partial(study_table, drift, "drift", "drift_fresh"),
     "field": lambda: field.field_table(committed("field")["cells"]),
     "frame_times": frame_times,
     "fuzz": fuzz,
@@ -180,7 +178,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
-    "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "splat_files": splat_files,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),

@@ -2,7 +2,7 @@
 
     python -m benchmarks.reports stability
 
-writes `benchmarks/results/stability.json`, and the tables and the plot of the page
+writes `benchmarks/results/stability.json`, and the table and the plot of the page
 docs/experiments/stability.md.
 
 The cases are shared with the tests (`tests.scenes.extremes`, `tests.scenes.hard_fits`). Image and
@@ -126,24 +126,14 @@ def _fit_rows(num_frames: int) -> Iterator[Row]:
 
 
 def stability_table(rows: Sequence[Row]) -> str:
-    """Return the largest errors and the largest time of each kind of cases."""
+    """Return the largest errors of each kind of cases."""
     lines = []
     for (kind,), group in grouped(rows, "kind").items():
         if "image" in group[0]:
+            image = max(row["image"] for row in group)
             gradients = (row.get(name, 0) for row in group for name in ATTRIBUTES)
-            image, seconds = (max(row[name] for row in group) for name in ("image", "seconds"))
-            lines.append((kind, f"{image:.0e}", f"{max(gradients):.0e}", f"{seconds:.2f}"))
-    return markdown(("kind", "image", "gradients", "s"), lines)
-
-
-def fits_table(rows: Sequence[Row]) -> str:
-    """Return the PSNR and the time of each fit."""
-    lines = []
-    for row in rows:
-        if row["kind"] == "fit":
-            cells = (f"{row['psnr'][-1]:.1f}", f"{row['seconds'] / row['frames']:.1f}")
-            lines.append((f"{row['name']}, {row['frames']} frames", *cells))
-    return markdown(("recording", "last PSNR, dB", "s a frame"), lines)
+            lines.append((kind, f"{image:.0e}", f"{max(gradients):.0e}"))
+    return markdown(("kind", "image", "gradients"), lines)
 
 
 def condition_plot(rows: Sequence[Row]) -> Figure:

@@ -28,7 +28,7 @@ SMALLER = {
     "demo": "--frames 3 --cameras 7",
     "render": "--width 240",
 }
-GUIDES = ("quickstart", "splat-files", "captures", "cameras", "colours", "checks")
+GUIDES = ("quickstart", "splat-files", "captures", "cameras", "colours")
 PAGES = ("README.md", *(f"docs/{name}.md" for name in GUIDES))
 # Commands that never end, or write outside of the folder.
 LEFT_OUT = ("morgs-mi view", "morgs-mi --tyro-write-completion")
