@@ -175,7 +175,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "fuzz": fuzz,
     "gains": gains,
     "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
-    "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     "splat_files": splat_files,
