@@ -1,4 +1,4 @@
-"""Rendered frames with their ground truth, and their similarity."""
+"""Rendered frames with their ground truth."""
 
 from __future__ import annotations
 
@@ -10,10 +10,6 @@ from morgs_mi.studio.synth.ground_truth import compute_ground_truth
 from morgs_mi.studio.synth.path_tracer import PathTracer
 
 FPS = 30.0
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2)))
 
 
 def render_frame(tracer: PathTracer, camera: Camera, frame: int) -> tuple[np.ndarray, GroundTruth]:
