@@ -15,15 +15,18 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
+from tests.assertions import assert_close
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
 
 WIDTH = 62
 HEIGHT = 46
 COUNT = 4
 FPS = 25
+DOT = np.array([0.25, 0.2, 0.1])
 
 
 def make_camera(i: int, name: str, shift: float = 0.0) -> Camera:
@@ -284,3 +287,19 @@ def shown_dot(image: np.ndarray) -> np.ndarray:
     weights = np.where(image[..., 0] > 60, image[..., 0], 0).astype(float)
     y, x = np.indices(weights.shape) + 0.5
     return np.array([(weights * x).sum(), (weights * y).sum()]) / weights.sum()
+
+
+def assert_dot_is_shown(capture: Capture) -> None:
+    """Assert that the images of `dot_clips` show DOT where the cameras project it."""
+    for camera, image in zip(capture.cameras, next(capture.frames()).images, strict=True):
+        assert_close(shown_dot(image), camera.project(DOT)[0], atol=0.15)
+
+
+def assert_is_rig(capture: Capture) -> None:
+    """Assert that a capture has the cameras of the rig with their principal points off by 3, and
+    their clips.
+    """
+    for camera, expected in zip(capture.cameras, rig(capture.names, shift=3), strict=True):
+        assert_close(camera.viewmat, expected.viewmat, atol=1e-9)
+        assert_close(camera.K, expected.K, atol=1e-6)
+    assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]

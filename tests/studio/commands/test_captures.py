@@ -32,10 +32,12 @@ def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -
 
 
 def test_info__lists_the_cameras_of_a_capture(capture: Path, run) -> None:
-    status, out, _ = run("info", capture)
+    status, out, _ = run("info", capture, "--no-check")
     assert status == 0
     assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
     assert f"{FRAMES} frames at 25 fps, 150 points, without ground truth." in out
+    assert "COLMAP" in out
+    assert "Reprojection" not in out
 
 
 @pytest.mark.slow
@@ -44,16 +46,16 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(
 ) -> None:
     path = tmp_path / ("capture of a rig in a folder with a long name" * 2)
     shutil.copytree(textured_capture.path, path)
-    grey = np.full((240, 320, 3), 128, np.uint8)
-    write_video(path / "cam1.mkv", [grey], 30)
+    write_video(path / "cam1.mkv", [np.full((240, 320, 3), 128, np.uint8)], 30)
     write_video(path / "cam2.mkv", [next(textured_capture.frames()).images[2][::-1, ::-1]], 30)
     status, out, _ = run("info", path)
     assert status == 0
-    assert "…" not in out
-    rows = {line.split()[1]: line for line in out.splitlines() if re.match(r" [0-5]  cam", line)}
-    assert re.search(r"train +0 +- +not checked", rows["cam1"])
-    assert re.search(r"train +\d+ +\d+\.\d\d +does not fit", rows["cam2"])
-    assert re.search(r"train +\d+ +0\.0\d +fits", rows["cam3"])
+    for row in (
+        r"cam1 .*train +0 +- +not checked",
+        r"cam2 .*train +\d+ +\d+\.\d\d +does not fit",
+        r"cam3 .*train +\d+ +0\.0\d +fits",
+    ):
+        assert re.search(row, out)
     assert "the poses of cam2 do not fit the images; not checked: cam1." in out
     assert "cam1 not checked: no matches with any other camera: check" in out
     assert "cam2 does not fit: its images are upside down" in out
@@ -63,22 +65,18 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(
 def test_info__prints_the_check_and_draws_the_rig(
     textured_capture: Capture, tmp_path: Path, run
 ) -> None:
+    path = textured_capture.path
     plot = tmp_path / "new" / "rig.png"
-    times = {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")}
-    status, out, _ = run("info", textured_capture.path, "--plot", plot)
+    times = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    status, out, _ = run("info", path, "--plot", plot)
     assert status == 0
-    assert "COLMAP" in out
     assert "1 frames at 30 fps, without points (" in out
     assert out.startswith("Views between the cameras will be good: 5 cameras, 7 degrees apart")
     assert "\nReprojection check: median 0.0" in out
     assert "in 15 pairs; the poses fit the images." in out
-    image = cv2.imread(str(plot))
-    assert image.shape == (760, 1440, 3)
-    assert {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")} == times
-    status, out, _ = run("info", textured_capture.path, "--no-check")
-    assert status == 0
-    assert "Reprojection" not in out
-    refused = run("info", textured_capture.path, "--plot", tmp_path / "rig.gif")
+    assert cv2.imread(str(plot)).shape == (760, 1440, 3)
+    assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == times
+    refused = run("info", path, "--plot", tmp_path / "rig.gif")
     assert_refused(refused, "the suffix of a plot must be .png, .jpg, .svg or .pdf, got '.gif'")
 
 

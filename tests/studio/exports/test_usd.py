@@ -42,41 +42,46 @@ def written(path: Path, states: int = 4, **options: Any) -> tuple[list[CodedFram
 
 def values(prim: Any, time: float, half: bool = False) -> dict[str, np.ndarray]:
     """Return the attributes of a prim at a time by their names as floats; quaternions are wxyz."""
-    names = [
-        "positions",
-        *(name + ("h" if half else "") for name in ("orientations", "scales", "opacities", SH)),
-    ]
-    arrays = {name: np.array(prim.GetAttribute(name).Get(time), np.float64) for name in names}
-    quats = prim.GetAttribute(names[1]).Get(time)
-    arrays[names[1]] = np.array([[q.GetReal(), *q.GetImaginary()] for q in quats], np.float64)
-    return {name.removesuffix("h") if half else name: array for name, array in arrays.items()}
+    arrays = {}
+    for name in ("positions", "orientations", "scales", "opacities", SH):
+        suffix = "h" if half and name != "positions" else ""
+        value = prim.GetAttribute(name + suffix).Get(time)
+        if name == "orientations":
+            value = [[q.GetReal(), *q.GetImaginary()] for q in value]
+        arrays[name] = np.array(value, np.float64)
+    return arrays
 
 
 def expected(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    turned = rotated(gaussians, gltf_axes(rig()))
-    raw = turned.numpy()
+    raw = gaussians.numpy()
     return {
         "positions": raw["means"],
-        "orientations": unit_quats(turned),
+        "orientations": unit_quats(gaussians),
         "scales": np.exp(raw["log_scales"]),
         "opacities": 1 / (1 + np.exp(-raw["logit_opacities"])),
-        SH: raw["sh_coeffs"].reshape(-1, 3),
+        SH: raw["sh_coeffs"],
     }
 
 
-def test_write_usd__adds_the_origin_of_the_header(tmp_path):
+def test_write_usd__describes_the_stage_with_the_origin_of_the_header(tmp_path):
     origin = [500000.0, 5300000.0, 120.0]
-    write_stream(tmp_path / "s.morgs", 1, metadata={"origin": origin})
-    write_usd(StreamReader(tmp_path / "s.morgs"), tmp_path / "a.usda", [0])
+    write_stream(tmp_path / "s.morgs", 4, metadata={"origin": origin})
+    write_usd(StreamReader(tmp_path / "s.morgs"), tmp_path / "a.usda", FRAMES)
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     prim = stage.GetDefaultPrim()
+    assert prim.GetPath() == "/Stream"
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
+    assert (stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()) == (10, 10)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 3)
+    back = np.array(prim.GetCustomDataByKey("world_from_usd"))
+    assert_close(gltf_axes(rig()).T @ back, np.eye(3), atol=1e-12)
     (place,) = UsdGeom.Xformable(prim).GetOrderedXformOps()
-    turn = np.array(prim.GetCustomDataByKey("world_from_usd"))
-    assert_close(np.array(place.Get()) @ turn, origin, atol=1e-6)
+    assert_close(np.array(place.Get()) @ back, origin, atol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])
-def test_write_usd__attributes_are_read_back(tmp_path, suffix):
+def test_write_usd__attributes_are_read_back(tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr("morgs_mi.studio.exports.usd.UNSAVED_BYTES", 100)
     states, stage = written(tmp_path / f"a{suffix}")
     prim = stage.GetPrimAtPath("/Stream/Gaussians")
     assert prim.IsA(UsdVol.ParticleField3DGaussianSplat)
@@ -87,20 +92,14 @@ def test_write_usd__attributes_are_read_back(tmp_path, suffix):
         alive = np.isin(np.arange(42), state.ids)
         assert [len(array) for array in arrays.values()] == [42, 42, 42, 42, 4 * 42]
         arrays[SH] = arrays[SH].reshape(42, 4, 3)
-        for name, value in expected(state.gaussians).items():
-            assert_close(arrays[name][alive].reshape(value.shape), value, rtol=1e-6, atol=1e-6)
+        gaussians = rotated(state.gaussians, gltf_axes(rig()))
+        for name, value in expected(gaussians).items():
+            assert_close(arrays[name][alive], value, rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(arrays["opacities"][~alive], 0)
-
-
-def test_write_usd__describes_the_stage(tmp_path):
-    _, stage = written(tmp_path / "a.usdc")
-    assert stage.GetDefaultPrim().GetPath() == "/Stream"
-    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
-    assert (stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()) == (10, 10)
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 3)
-    back = np.array(stage.GetDefaultPrim().GetCustomDataByKey("world_from_usd"))
-    point = np.array([1.0, 2, 3])
-    assert_close((gltf_axes(rig()) @ point) @ back, point, atol=1e-12)
+        means = gaussians.numpy()["means"]
+        reach = 3 * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
+        extent = np.array([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+        assert_close(np.array(prim.GetAttribute("extent").Get(state.frame)), extent, atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])
@@ -123,23 +122,19 @@ def test_write_usd__passes_the_validators_of_openusd(tmp_path, suffix, half):
 
 
 def test_write_usd__interpolates_the_same_gaussians_between_frames(tmp_path):
-    """In frame 2 one dies and two are born."""
+    """In frame 2 one dies and two are born. What does not change has no further samples."""
     states, stage = written(tmp_path / "a.usdc")
     prim = stage.GetPrimAtPath("/Stream/Gaussians")
     middle, left, right = (values(prim, time) for time in (1.5, 1, 2))
     survivors = np.isin(np.arange(42), np.intersect1d(states[1].ids, states[2].ids))
-    assert_close(middle["positions"], (left["positions"] + right["positions"]) / 2, atol=1e-6)
-    assert np.linalg.norm(right["positions"] - left["positions"], axis=1)[survivors].max() > 0.09
+    for name in ("positions", "opacities"):
+        assert_close(middle[name], (left[name] + right[name]) / 2, atol=1e-6)
+    motion = right["positions"] - left["positions"]
+    assert np.abs(motion[survivors]).max() > 0.09
     # Births and deaths stay in their places and fade.
-    assert_close(right["positions"][~survivors], left["positions"][~survivors], atol=0)
-    assert_close(middle["opacities"], (left["opacities"] + right["opacities"]) / 2, atol=1e-6)
+    assert_close(motion[~survivors], 0)
     assert left["opacities"][0] > 0
     assert right["opacities"][0] == 0
-
-
-def test_write_usd__has_no_samples_of_what_does_not_change(tmp_path):
-    _, stage = written(tmp_path / "a.usdc")
-    prim = stage.GetPrimAtPath("/Stream/Gaussians")
     assert prim.GetAttribute("positions").GetTimeSamples() == [0, 1, 2, 3]
     assert prim.GetAttribute("scales").GetTimeSamples() == [0]
     # A value that stays is held up to the last frame before it changes.
@@ -147,32 +142,18 @@ def test_write_usd__has_no_samples_of_what_does_not_change(tmp_path):
 
 
 def test_write_usd__half_precision_is_about_half_as_large(tmp_path):
-    N = 2000
-    with StreamWriter(tmp_path / "s.morgs", rig(), 10) as writer:
-        writer.write(keyframe_packet(splats(N, 3), 0, rig()))
-    stream = StreamReader(tmp_path / "s.morgs")
+    write_stream(tmp_path / "s.morgs", 1, splats(2000, 3))
     for name, half in (("full.usdc", False), ("half.usdc", True)):
-        write_usd(stream, tmp_path / name, [0], half)
+        write_usd(StreamReader(tmp_path / "s.morgs"), tmp_path / name, [0], half)
     stages = [Usd.Stage.Open(str(tmp_path / name)) for name in ("full.usdc", "half.usdc")]
     prims = [stage.GetPrimAtPath("/Stream/Gaussians") for stage in stages]
     full = values(prims[0], 0)
     half = values(prims[1], 0, half=True)
-    assert_close(half["positions"], full["positions"], atol=0)
+    assert_close(half["positions"], full["positions"])
     for name, value in full.items():
         assert_close(half[name], value, rtol=2**-11, atol=1e-4)
     assert not prims[1].GetAttribute("scales").HasAuthoredValue()
     assert (tmp_path / "half.usdc").stat().st_size < 0.6 * (tmp_path / "full.usdc").stat().st_size
-
-
-def test_write_usd__extent_contains_three_standard_deviations(tmp_path):
-    states, stage = written(tmp_path / "a.usdc")
-    prim = stage.GetPrimAtPath("/Stream/Gaussians")
-    turned = rotated(states[2].gaussians, gltf_axes(rig()))
-    means = turned.numpy()["means"]
-    sigmas = np.sqrt(np.diagonal(covariances(turned), axis1=1, axis2=2))
-    low, high = np.array(prim.GetAttribute("extent").Get(2))
-    assert_close(low, (means - 3 * sigmas).min(axis=0), atol=1e-5)
-    assert_close(high, (means + 3 * sigmas).max(axis=0), atol=1e-5)
 
 
 def test_write_usd__begins_a_prim_for_a_new_set_of_gaussians(tmp_path):
@@ -184,27 +165,13 @@ def test_write_usd__begins_a_prim_for_a_new_set_of_gaussians(tmp_path):
     prims = stage.GetDefaultPrim().GetChildren()
     assert [prim.GetName() for prim in prims] == [
         "Gaussians",
-        "Gaussians1",
-        "Gaussians2",
-        "Gaussians3",
+        *(f"Gaussians{k}" for k in (1, 2, 3)),
     ]
-    for t in FRAMES:
-        visible = [UsdGeom.Imageable(prim).ComputeVisibility(t) == "inherited" for prim in prims]
-        assert visible == [k == t for k in range(4)]
+    visible = [[UsdGeom.Imageable(p).ComputeVisibility(t) for t in FRAMES] for p in prims]
+    np.testing.assert_array_equal(np.array(visible) == "inherited", np.eye(4, dtype=bool))
     degrees = [prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() for prim in prims]
     assert degrees == [0, 1, 1, 2]
     assert [len(prim.GetAttribute("positions").Get(0) or ()) for prim in prims] == [5, 7, 0, 3]
-
-
-def test_write_usd__saves_now_and_then(tmp_path, monkeypatch):
-    monkeypatch.setattr("morgs_mi.studio.exports.usd.UNSAVED_BYTES", 100)
-    states, stage = written(tmp_path / "a.usdc")
-    for state in states:
-        alive = np.isin(np.arange(42), state.ids)
-        positions = values(stage.GetPrimAtPath("/Stream/Gaussians"), state.frame)["positions"][
-            alive
-        ]
-        assert_close(positions, expected(state.gaussians)["positions"], atol=1e-6)
 
 
 def test_export_usd__writes_selected_frames(tmp_path, capsys):
@@ -217,15 +184,6 @@ def test_export_usd__writes_selected_frames(tmp_path, capsys):
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1, 2)
     assert cli.main(["export", "usd", str(tmp_path)]) == 0
     assert (tmp_path / "stream.usdc").is_file()
-
-
-def test_export_usd__names_an_output_that_cannot_be_written(tmp_path, capfd):
-    write_stream(tmp_path / "stream.morgs", 1)
-    assert cli.main(["export", "usd", str(tmp_path), "/sys/a.usdc"]) == 1
-    error = capfd.readouterr().err
-    assert "Cannot write /sys/a.usdc" in error
-    assert "Traceback" not in error
-    assert [path.name for path in tmp_path.iterdir()] == ["stream.morgs"]
 
 
 @pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx.parser
+import onnx
 import pytest
-from onnx import TensorProto, helper
+from onnx.external_data_helper import set_external_data
 
 from morgs_mi.studio.networks.onnx_file import OnnxNetwork, imagenet_blob
 from tests.assertions import assert_close
@@ -20,10 +21,9 @@ VALUES = 1024
 
 
 def test_onnx_network__has_names_and_shapes(tmp_path):
-    open_size = OnnxNetwork(export(tmp_path / "open.onnx"))
-    assert open_size.inputs == {"image1": (1, 3, None, None), "image2": (1, 3, None, None)}
-    assert open_size.outputs == ("flow_low", "flow_up")
-    assert OnnxNetwork(export(tmp_path / "fixed.onnx", 64, 96)).inputs["image2"] == (1, 3, 64, 96)
+    network = OnnxNetwork(export(tmp_path / "open.onnx", width=96))
+    assert network.inputs == dict.fromkeys(("image1", "image2"), (1, 3, None, 96))
+    assert network.outputs == ("flow_low", "flow_up")
 
 
 def test_onnx_network__has_at_most_the_threads_of_opencv(tmp_path, monkeypatch):
@@ -44,16 +44,11 @@ def test_onnx_network__names_the_extra_that_is_missing(tmp_path, monkeypatch):
 
 def with_weights_at(path: Path, location: str) -> Path:
     """Write a network that adds weights in a further file at `location`."""
-    weights = TensorProto(
-        name="w", data_type=TensorProto.FLOAT, dims=[VALUES], data_location=TensorProto.EXTERNAL
-    )
-    for key, value in (("location", location), ("offset", "0"), ("length", str(4 * VALUES))):
-        weights.external_data.add(key=key, value=value)
-    graph = onnx.parser.parse_graph(
-        f"sum (float[{VALUES}] x) => (float[{VALUES}] y) {{ y = Add(x, w) }}"
-    )
-    graph.initializer.append(weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
+    graph = f"sum (float[{VALUES}] x) => (float[{VALUES}] y) {{ y = Add(x, w) }}"
+    model = onnx.load(write(path, graph, w=np.zeros(VALUES, np.float32)))
+    (weights,) = model.graph.initializer
+    set_external_data(weights, location, offset=0, length=4 * VALUES)
+    weights.ClearField("raw_data")
     path.write_bytes(model.SerializeToString())
     return path
 
@@ -91,13 +86,7 @@ def endless_number(path: Path) -> None:
             ValueError,
             r"onnxruntime .* cannot load this network \(.*\); export it again",
         ),
-        (lambda path: path.write_bytes(b"\x08"), ValueError, r"cannot load this network"),
         (os.mkfifo, FileNotFoundError, "expected an ONNX file, found none"),
-        (
-            lambda path: export(path, 40000, 40000),
-            ValueError,
-            r"at most \d+ values, got \[1, 3, 40000, 40000\] and",
-        ),
         (lambda path: export(path, 2**40, 8), ValueError, r"got \[1, 3, 1099511627776, 8\]"),
     ],
 )
@@ -112,7 +101,7 @@ def test_onnx_network__refuses_damaged_files_with_one_sentence(tmp_path, capfd):
     path = tmp_path / "a.onnx"
     rng = np.random.default_rng(0)
     whole = export(path).read_bytes()
-    failed = []
+    messages = []
     inputs = dict.fromkeys(("image1", "image2"), np.zeros((1, 3, 16, 24), np.float32))
     for _ in range(200):
         damaged = bytearray(whole)
@@ -121,12 +110,10 @@ def test_onnx_network__refuses_damaged_files_with_one_sentence(tmp_path, capfd):
         try:
             OnnxNetwork(path).run(inputs)
         except ValueError as error:
-            failed.append(str(error))
-    assert len(failed) > 50
+            messages.append(str(error))
+    assert len(messages) > 50
+    assert all(re.fullmatch(rf"{path}: [^\n]+", message) for message in messages)
     assert capfd.readouterr() == ("", "")
-    assert [
-        message for message in failed if not message.startswith(f"{path}: ") or "\n" in message
-    ] == []
 
 
 def test_onnx_network__refuses_results_that_are_not_numbers(tmp_path):
