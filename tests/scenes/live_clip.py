@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 
@@ -42,3 +43,9 @@ def write_videos(folder: Path) -> list[Path]:
     for path, clip in zip(paths, clips(), strict=True):
         write_video(path, clip, FPS)
     return paths
+
+
+def connection(*images: np.ndarray, opens: bool = True) -> Mock:
+    """Return what OpenCV opens: a camera or an address that delivers some images."""
+    reads = [(True, image) for image in images] + [(False, None)] * 99
+    return Mock(**{"isOpened.return_value": opens, "read.side_effect": reads})

@@ -44,6 +44,20 @@ def glowing(color: Any = COLOR) -> dict[str, Any]:
     return {"bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": emitter}
 
 
+def mirrored(color: float, opacity: float, n: int) -> tuple[Gaussians, Camera, Camera, dict]:
+    """Return n Gaussians behind a camera, the camera, its mirror image, and the mirror at z = 0.
+
+    Coefficients have the standard deviations `color` in degree 0 and 0.1 in degree 1.
+    """
+    rng = np.random.default_rng(3)
+    means = np.stack([*rng.uniform(-1.5, 1.5, (2, n)), rng.uniform(-6, -5, n)], axis=1)
+    deviations = np.array([color, 0.1, 0.1, 0.1])[:, None]
+    gaussians = isotropic(means, 0.4, opacity, rng.normal(size=(n, 4, 3)) * deviations)
+    view, image = (Camera.look_at((0, 0, z), (0, 0, 0), (0, -1, 0), 40, 48, 36) for z in (-3, 3))
+    mirror = wall(0, 4, bsdf={"type": "conductor", "material": "none"})
+    return gaussians, view, image, mirror
+
+
 LAMP = {
     "type": "point",
     "position": [1.0, -2.0, -3.0],

@@ -126,7 +126,7 @@ COPIES = splats(1).select(np.zeros(50, int))
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "expected"),
+    ("old", "new", "expected"),
     [
         (
             moving(0).select(np.arange(100)),
@@ -145,8 +145,8 @@ COPIES = splats(1).select(np.zeros(50, int))
     ],
     ids=["loses and grows", "grows inside", "moves", "one", "copies", "fewer copies"],
 )
-def test_matched_rows__follow_the_order_of_both_frames(before, now, expected):
-    np.testing.assert_array_equal(matched_rows(before, now), expected)
+def test_matched_rows__follow_the_order_of_both_frames(old, new, expected):
+    np.testing.assert_array_equal(matched_rows(old, new), expected)
 
 
 @pytest.mark.parametrize(

@@ -148,9 +148,9 @@ def test_leave_out__finds_the_parts_that_are_not_needed_together(
     config = apply_values(StreamConfig(), tomllib.loads(result.toml))
     for part, text in PARTS.items():
         assert (apply_values(config, tomllib.loads(text)) == config) == (part in left_out)
-    *rows, together = result.table[2:]
+    *rows, last_row = result.table[2:]
     assert [row[-1] == "yes" for row in rows] == [part in needed - {"search"} for part in PARTS]
-    assert together[-1] == "no"
+    assert last_row[-1] == "no"
 
 
 def test_leave_out__may_find_that_all_parts_are_needed(tmp_path, monkeypatch):

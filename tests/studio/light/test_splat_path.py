@@ -22,6 +22,7 @@ from tests.scenes.surfaces import (
     camera,
     cloud,
     glowing,
+    mirrored,
     render,
     scene,
     slopes_of,
@@ -36,34 +37,27 @@ SUN = {"type": "directional", "direction": TO_WALL.tolist(), "irradiance": 2.0}
 TRACED = {"type": "splat_path", "max_depth": 2, "clipped": 1.0}
 WHITE = 0.5 / SH_C0
 BLACK = -0.5 / SH_C0
+DARK = {"type": "constant", "radiance": 0.0}
+
+
+FAR = isotropic([(0, 0, -90)], 0.1, 0.5)
 
 
 def ratio(
     gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any
 ) -> np.ndarray:
     """Return the image of the lit wall with Gaussians beside the view, over that without them."""
-    far = isotropic([(0, 0, -90)], 0.1, 0.5)
-    shapes = {"wall": wall(1), "sun": SUN}
-    light, alone = (
-        render(scene(g, integrator, **shapes, **entries), spp=spp)
-        for g, entries in ((gaussians, more), (far, {}))
-    )
-    return (light / alone)[..., 0]
-
-
-def points_on_wall() -> np.ndarray:
-    """Return the points [H, W, 3] of the wall at the centres of the pixels."""
-    view = camera()
-    y, x = np.mgrid[: view.height, : view.width] + 0.5
-    K = view.K
-    return np.stack(
-        [5 * (x - K[0, 2]) / K[0, 0], 5 * (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1
-    )
+    lit = {"wall": wall(1), "sun": SUN}
+    light = render(scene(gaussians, integrator, **lit, **more), spp=spp)
+    return (light / render(scene(FAR, integrator, **lit), spp=spp))[..., 0]
 
 
 def distance_to_aside() -> np.ndarray:
-    """Return the distance [H, W] of ASIDE from the light that falls on each pixel."""
-    return np.linalg.norm(np.cross(points_on_wall() - ASIDE, TO_WALL), axis=-1)
+    """Return the distance [H, W] of ASIDE from the light that falls on the wall at each pixel."""
+    view = camera()
+    y, x = np.mgrid[: view.height, : view.width] + 0.5
+    points = view.unproject(np.stack([x, y], axis=-1), np.full(x.shape, 5.0))
+    return np.linalg.norm(np.cross(points - ASIDE, TO_WALL), axis=-1)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -94,22 +88,16 @@ def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     x, y, z = directions.T
     quats = np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)  # from the z axis to the normal
+    means = ASIDE + 0.6 * directions
+    scales = np.tile([0.03, 0.03, 1e-3], (3000, 1))
     black = np.full((3000, 1, 3), BLACK)
-    shell = Gaussians.from_activated(
-        ASIDE + 0.6 * directions,
-        np.tile([0.03, 0.03, 1e-3], (3000, 1)),
-        quats,
-        np.full(3000, 0.95),
-        black,
-    )
+    shell = Gaussians.from_activated(means, scales, quats, np.full(3000, 0.95), black)
     mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
     shadow = ratio(shell)
-    expected = ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
-    mask = distance_to_aside() < 0.45
-    outside = distance_to_aside() > 0.7
-    for region, value in ((mask, 0), (outside, 1)):
-        assert_close(expected[region], value, atol=1e-5)
-        assert_close(shadow[region], value, atol=5e-3)
+    expected = ratio(FAR, {"type": "direct"}, ball=mesh)
+    for image, atol in ((expected, 1e-5), (shadow, 5e-3)):
+        assert_close(image[distance_to_aside() < 0.45], 0, atol=atol)
+        assert_close(image[distance_to_aside() > 0.7], 1, atol=atol)
     assert shadow.mean() == pytest.approx(expected.mean(), abs=0.015)
 
 
@@ -118,11 +106,10 @@ def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
     its depth.
     """
     bulb = {"type": "point", "position": ASIDE.tolist(), "intensity": 9.0}
-    shapes = {"wall": wall(1), "bulb": bulb}
-    behind, cut, far = (
-        isotropic([place], 0.3, 0.75, BLACK) for place in (ASIDE - 2 * TO_WALL, ASIDE, (0, 0, -90))
-    )
-    images = [render(scene(gaussians, TRACED, **shapes), spp=1) for gaussians in (behind, cut, far)]
+    behind, cut = (isotropic([at], 0.3, 0.75, BLACK) for at in (ASIDE - 2 * TO_WALL, ASIDE))
+    images = [
+        render(scene(each, TRACED, wall=wall(1), bulb=bulb), spp=1) for each in (behind, cut, FAR)
+    ]
     assert_close(images[0], images[2], atol=1e-5)
     assert_close((images[1] / images[2])[12, 16], 0.5, atol=1e-3)
 
@@ -132,40 +119,32 @@ def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
 # --------------------------------------------------------------------------------------------------
 
 
+def light_of(gaussians: Gaussians, view: Camera, srgb: bool = True) -> np.ndarray:
+    """Return the premultiplied linear light of Gaussians in a view.
+
+    A pixel averages over a square of variance 1 / 12 px^2 in each direction.
+    """
+    images = rasterize(gaussians, view, ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
+    color, alpha = (np.asarray(value, np.float64) for value in (images.color, images.alpha))
+    return alpha * decode_light(color / np.maximum(alpha, 1e-6)) if srgb else color
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("srgb", [True, False])
 def test_splat_path__mirror_shows_the_view_of_the_mirrored_camera(srgb):
-    rng = np.random.default_rng(3)
-    means = np.stack([*rng.uniform(-1.5, 1.5, (2, 60)), rng.uniform(-6, -5, 60)], axis=1)
-    gaussians = isotropic(means, 0.4, 0.8, rng.normal(size=(60, 4, 3)) * [[0.8], *[[0.1]] * 3])
-    view, mirrored = (Camera.look_at((0, 0, z), (0, 0, 0), (0, -1, 0), 40, 48, 36) for z in (-3, 3))
-    mirror = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180).scale(4),
-        "bsdf": {"type": "conductor", "material": "none"},
-    }
-    dark = {"type": "constant", "radiance": 0.0}
+    gaussians, view, image_of_view, mirror = mirrored(0.8, 0.8, 60)
     props = {"srgb_primitives": srgb}
     image = render(
-        scene(gaussians, TRACED, view=view, mirror=mirror, dark=dark, props=props), spp=64
+        scene(gaussians, TRACED, view=view, mirror=mirror, dark=DARK, props=props), spp=64
     )
-    # A pixel averages over a square of variance 1 / 12 px^2 in each direction.
-    expected = rasterize(gaussians, mirrored, ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
-    color, alpha = (
-        np.asarray(value, np.float64)[:, ::-1] for value in (expected.color, expected.alpha)
-    )
-    layer = alpha * decode_light(color / np.maximum(alpha, 1e-6)) if srgb else color
-    assert psnr(image, layer) > 36
+    assert psnr(image, light_of(gaussians, image_of_view, srgb)[:, ::-1]) > 36
 
 
 def test_splat_path__glass_without_refraction_shows_what_is_behind_it():
     behind = cloud(1.0)
     pane = wall(0, bsdf={"type": "dielectric", "int_ior": 1.0001, "ext_ior": 1.0})
-    dark = {"type": "constant", "radiance": 0.0}
-    image = render(scene(behind, {**TRACED, "max_depth": 4}, pane=pane, dark=dark), spp=256)
-    expected = rasterize(behind, camera(), ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
-    color, alpha = (np.asarray(value, np.float64) for value in (expected.color, expected.alpha))
-    assert psnr(image, alpha * decode_light(color / np.maximum(alpha, 1e-6))) > 35
+    image = render(scene(behind, {**TRACED, "max_depth": 4}, pane=pane, dark=DARK), spp=256)
+    assert psnr(image, light_of(behind, camera())) > 35
 
 
 def test_splat_path__camera_sees_the_splats_in_front_of_surfaces_as_before():
@@ -184,8 +163,7 @@ def test_splat_path__clipped_colours_are_brighter_than_white():
         6 * directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.5, 0.98, WHITE
     )
     ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "conductor", "material": "none"}}
-    dark = {"type": "constant", "radiance": 0.0}
-    image = render(scene(shell, {**TRACED, "clipped": 3.0}, ball=ball, dark=dark), spp=4)
+    image = render(scene(shell, {**TRACED, "clipped": 3.0}, ball=ball, dark=DARK), spp=4)
     assert image[12, 16, 0] == pytest.approx(3, abs=0.01)
 
 

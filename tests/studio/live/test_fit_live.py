@@ -7,10 +7,11 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -75,22 +76,20 @@ def test_fit_live__follows_videos_at_their_speed(
     )
     assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
     assert [row.frame for row in rows] == [0, 1, 2, 3]
-    for previous_row, row in pairwise(rows):
-        assert row.time > previous_row.time
+    assert min(np.diff([row.time for row in rows])) > 0
+    for row in rows[1:]:
         assert row.latency >= 0
         assert not row.problems
         assert row.skew <= 0.5
     assert sum(row.dropped for row in rows) > 0, "the fit is slower than the clip"
     assert sum(row.dropped + 1 for row in rows[1:]) <= FPS * rows[-1].time + 4
-    recorded = list(load_capture(out / "capture").images(2))
-    assert all(any(np.array_equal(image, other) for other in clips()[2]) for image in recorded)
     report = json.loads((out / "report.json").read_text())
     assert [row["dropped"] for row in report["live"]] == [row.dropped for row in rows]
     assert open_stream(out).closed()
+    recorded = list(load_capture(out / "capture").images(2))
+    assert all(any(np.array_equal(image, other) for other in clips()[2]) for image in recorded)
     # The live fit equals the fit of a recording of its frames, to the bit.
-    capture = load_capture(out / "capture", 4)
-    assert capture.num_frames == 4
-    stream_capture(capture, tmp_path / "again", CONFIG)
+    stream_capture(load_capture(out / "capture", 4), tmp_path / "again", CONFIG)
     assert packets(out) == packets(tmp_path / "again")
 
 
@@ -107,23 +106,26 @@ def deliver(
 
 
 @pytest.mark.slow
-def test_fit_live__leaves_out_a_camera_that_stops(
+def test_fit_live__leaves_out_images_of_another_size_and_a_camera_that_stops(
     tmp_path: Path, rig: Path, cameras: list[deque[np.ndarray]], caplog
 ) -> None:
+    """cam2 changes the size of its images in frame 1, cam1 stops after it."""
     deliver(cameras, 0)
-    live = LiveConfig(rig, downscale=4, frames=3, timeout=0.5, warm_up=0)
-    others = ("cam0", "cam2", "cam3")
-    rows = fit_live(
-        range(4),
-        tmp_path / "out",
-        live,
-        CONFIG,
-        lambda row, _: deliver(cameras, row.frame + 1, others),
-    )
-    assert [bool(row.problems) for row in rows] == [False, True, True]
-    assert [record.message for record in caplog.records if "left out" in record.message] == [
-        "frame 1: cam1 is left out: no image for 0.5 s"
+    live = LiveConfig(rig, downscale=4, frames=3, timeout=2, warm_up=0)
+
+    def deliver_next(row, _) -> None:
+        if row.frame == 0:
+            deliver(cameras, 1, cam2=(100, 75))
+        else:
+            deliver(cameras, 2, ("cam0", "cam2", "cam3"))
+
+    _, *rows = fit_live(range(4), tmp_path / "out", live, CONFIG, deliver_next)
+    assert [row.problems for row in rows] == [
+        ("cam2: expected an image of 200x150, got 100x75",),
+        ("cam1: no image for 2 s",),
     ]
+    assert "frame 2: cam1 is left out: no image for 2 s" in caplog.messages
+    assert not (tmp_path / "out" / "capture" / "cam2" / "0001.png").exists()
 
 
 @pytest.mark.slow
@@ -134,19 +136,6 @@ def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(
     fit_live([videos[0], *videos[2:]], tmp_path / "out", live, CONFIG)
     assert load_capture(tmp_path / "out" / "capture").names == ("cam0", "cam2", "cam3")
     assert not (tmp_path / "out" / "capture" / "cam1").exists()
-
-
-@pytest.mark.slow
-def test_fit_live__leaves_out_images_of_another_size(
-    tmp_path: Path, rig: Path, cameras: list[deque[np.ndarray]]
-) -> None:
-    deliver(cameras, 0)
-    live = LiveConfig(rig, downscale=4, frames=2, timeout=5, warm_up=0)
-    _, row = fit_live(
-        range(4), tmp_path / "out", live, CONFIG, lambda *_: deliver(cameras, 1, cam2=(100, 75))
-    )
-    assert row.problems == ("cam2: expected an image of 200x150, got 100x75",)
-    assert not (tmp_path / "out" / "capture" / "cam2" / "0001.png").exists()
 
 
 @pytest.mark.slow
@@ -170,9 +159,8 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(
 
     live = LiveConfig(rig, downscale=2, loop=True)
     rows = fit_live(videos, tmp_path / "out", live, CONFIG, interrupt)
-    assert [row.frame for row in rows] == [0, 1]
+    assert len(rows) == len(packets(tmp_path / "out")) == 2
     assert open_stream(tmp_path / "out").closed()
-    assert len(packets(tmp_path / "out")) == 2
 
     def interrupt_first(stage: str, done: int, total: int) -> None:
         if stage == "First frame" and done:
@@ -190,17 +178,10 @@ def test_fit_live__ends_with_a_reason(
     deliver(cameras, 0)
     live = LiveConfig(rig, downscale=4, timeout=0.2, warm_up=0)
     assert len(fit_live(range(4), tmp_path / "out", live, CONFIG)) == 1
-    (message,) = (
-        record.message
-        for record in caplog.records
-        if record.name == "morgs_mi.studio.live.fit_live"
-    )
-    assert message == ("the fit ends after frame 0: cam0, cam1, cam2, cam3: no image for 0.2 s")
-
-    def fill_disk(*_: object) -> None:
-        raise OSError("the disk is full")
-
+    reason = "the fit ends after frame 0: cam0, cam1, cam2, cam3: no image for 0.2 s"
+    assert reason in caplog.messages
     deliver(cameras, 0)
+    fill_disk = Mock(side_effect=OSError("the disk is full"))
     with pytest.raises(OSError, match="the disk is full") as failed:
         fit_live(range(4), tmp_path / "full", live, CONFIG, fill_disk)
     assert failed.value.__notes__ == [f"{tmp_path / 'full' / 'stream.morgs'} ends with frame 0."]
@@ -287,21 +268,15 @@ def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path
     ("changes", "message"),
     [
         (
-            {"without": ("cam0",)},
+            {"calibration": None, "without": ("cam0",)},
             r"`without` must name cameras of a calibration, got cam0 and no calibration",
         ),
-        (
-            {"calibration": Path("RIG"), "without": ("cam7",)},
-            "`without` must name cameras of cam0, cam1, .*, got cam7",
-        ),
-        ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
+        ({"without": ("cam7",)}, "`without` must name cameras of cam0, cam1, .*, got cam7"),
         ({"frames": 0}, "`frames` must be at least 1, got 0"),
-        ({"timeout": 0.0}, "`timeout` must be above 0 and at most 1000000, got 0.0"),
     ],
 )
 def test_fit_live__refuses_settings_out_of_range(
     tmp_path: Path, rig: Path, changes: dict[str, Any], message: str
 ) -> None:
-    changes = {name: rig if value == Path("RIG") else value for name, value in changes.items()}
     with pytest.raises(ValueError, match=message):
-        fit_live([0], tmp_path / "out", LiveConfig(**changes))
+        fit_live([0], tmp_path / "out", replace(LiveConfig(rig), **changes))

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from itertools import islice
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.studio.live.sources import live_frames
 from tests.scenes import captures as layouts
+from tests.scenes.live_clip import connection
 
 NAMES = ("cam1", "cam2", "cam3")
 
@@ -97,38 +99,17 @@ def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> 
     """The loop over live frames in docs/live.md, with clips in place of connections."""
     text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    opened = []
-    pushed = []
-
-    class Connection:
-        def __init__(self, address: str, *_: object) -> None:
-            opened.append(address)
-            self.images = clip()
-
-        def isOpened(self) -> bool:
-            return True
-
-        def read(self):
-            image = self.images.pop(0) if self.images else None
-            return image is not None, image
-
-        def release(self) -> None: ...
-
-    class Loop:
-        def __init__(self, cameras, points, colors, config=None, masks=None):
-            assert len(cameras) == len(masks) == 3
-
-        def push(self, images):
-            pushed.append(images)
-            return None, type(
-                "Report", (), {"frame": len(pushed) - 1, "missing_views": (), "seconds": 0.0}
-            )
-
-    monkeypatch.setattr(cv2, "VideoCapture", Connection)
-    monkeypatch.setattr("morgs_mi.StreamLoop", Loop)
+    opens = Mock(side_effect=[connection(*clip()) for _ in NAMES])
+    loop = Mock(
+        **{"return_value.push.return_value": (None, Mock(frame=0, seconds=0.0, missing_views=()))}
+    )
+    monkeypatch.setattr(cv2, "VideoCapture", opens)
+    monkeypatch.setattr("morgs_mi.StreamLoop", loop)
     monkeypatch.setattr("morgs_mi.load_capture", lambda path, downscale: rig)
     monkeypatch.setattr("mitsuba.set_variant", lambda name: None)
     exec(compile(example, "live.md", "exec"), {})
-    assert opened == [f"rtsp://10.0.0.{k}/live" for k in (10, 11, 12)]
+    addresses = [call.args[0] for call in opens.call_args_list]
+    assert addresses == [f"rtsp://10.0.0.{k}/live" for k in (10, 11, 12)]
+    pushed = [call.args[0] for call in loop().push.call_args_list]
     assert len(pushed) == 3
     assert all(image.shape == (23, 31, 3) for image in pushed[0])

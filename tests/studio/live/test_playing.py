@@ -23,8 +23,8 @@ def clip(path: Path, count: int, fps: float = 50) -> Path:
     return path
 
 
-def played(paths: list[Path], count: int, loop: bool) -> list[list[tuple[float, int]]]:
-    """Return the time and the number of the first images of each clip."""
+def played(paths: list[Path], count: int, loop: bool) -> list[np.ndarray]:
+    """Return the time and the number [count, 2] of the first images of each clip."""
     clock = ClipClock(len(paths))
     rows = [[] for _ in paths]
     start = time.monotonic()
@@ -38,58 +38,41 @@ def played(paths: list[Path], count: int, loop: bool) -> list[list[tuple[float, 
         thread.start()
     for thread in threads:
         thread.join(20)
-    return rows
+    return [np.array(each) for each in rows]
 
 
 def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
     (rows,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
-    times, numbers = zip(*rows, strict=True)
-    assert numbers == (0, 1, 2, 3, 4, 5)
+    times, numbers = rows.T
+    assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
     assert times[-1] - times[0] >= 5 / 20 - 0.01
     assert np.all(np.diff(times) > 0.02), "not all at once"
 
 
 def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None:
-    a, b, c = played(
-        [clip(tmp_path / f"{n}.mkv", n, fps) for n, fps in ((6, 50), (9, 50), (5, 25))],
-        20,
-        loop=True,
-    )
-    assert [number for _, number in a] == [*range(6)] * 3 + [0, 1]
-    assert [number for _, number in b] == [number for _, number in a], "without its last three"
-    assert [number for _, number in c] == [0, 1, 2] * 6 + [0, 1], (
-        "at half the rate, without its last two"
-    )
-    starts = [np.array([time for time, number in rows if number == 0][:4]) for rows in (a, b, c)]
+    lengths = ((6, 50), (9, 50), (5, 25))
+    paths = [clip(tmp_path / f"{count}.mkv", count, fps) for count, fps in lengths]
+    times, numbers = np.moveaxis(played(paths, 20, loop=True), 2, 0)
+    assert numbers[0].tolist() == [*range(6)] * 3 + [0, 1]
+    assert numbers[1].tolist() == numbers[0].tolist(), "without its last three"
+    slow = [0, 1, 2] * 6 + [0, 1]
+    assert numbers[2].tolist() == slow, "at half the rate, without its last two"
+    starts = np.stack([time[number == 0][:4] for time, number in zip(times, numbers, strict=True)])
     # The median, because a busy machine may show one image late.
     assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.019, "within an interval"
 
 
 def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = {"slow": 0, "fast": 0}
-
-    def timed(path: str) -> Iterator[tuple[np.ndarray, float, float]]:
+    def timed(path: Path) -> Iterator[tuple[np.ndarray, float, float]]:
         for k in range(20):
-            if path == "slow":
-                time.sleep(0.02)
-            yield np.zeros((2, 2, 3), np.uint8), k / 100, 1 / 100
+            time.sleep(0.02 * (path.name == "slow"))
+            yield np.full((2, 2, 3), 10 * k, np.uint8), k / 100, 1 / 100
 
     monkeypatch.setattr(module, "timed_images", timed)
-    clock = ClipClock(2)
-    ahead = []
-
-    def read(k: int, path: str) -> None:
-        for _ in play(path, clock, Event(), k):
-            shown[path] += 1
-            ahead.append(shown["fast"] - shown["slow"])
-
-    threads = [Thread(target=read, args=item, daemon=True) for item in enumerate(shown)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(20)
-    assert shown == {"slow": 20, "fast": 20}
-    assert np.abs(ahead).max() <= 2
+    slow, fast = played([Path("slow"), Path("fast")], 99, loop=False)
+    assert slow[:, 1].tolist() == fast[:, 1].tolist() == [*range(20)]
+    assert (fast[2:, 0] > slow[:-2, 0]).all()
+    assert (slow[2:, 0] > fast[:-2, 0]).all()
 
 
 def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
@@ -115,15 +98,10 @@ def test_play__refuses_what_has_no_image(tmp_path: Path) -> None:
 
 
 def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
-    for name in ("clip.mp4", "cam.sdp"):
-        (tmp_path / name).touch()
-    sources = (
-        tmp_path / "clip.mp4",
-        str(tmp_path / "cam.sdp"),
-        tmp_path,
-        tmp_path / "nowhere.mp4",
-        0,
-    )
+    paths = [tmp_path / name for name in ("clip.mp4", "cam.sdp")]
+    for path in paths:
+        path.touch()
+    sources = (*paths, tmp_path, tmp_path / "nowhere.mp4", 0)
     assert [is_video(source) for source in sources] == [True, False, False, False, False]
 
 

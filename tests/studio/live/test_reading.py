@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from itertools import islice
 from threading import Event
+from unittest.mock import Mock, call
 
 import cv2
 import numpy as np
@@ -12,48 +13,22 @@ import pytest
 
 from morgs_mi.studio.live import sources as module
 from morgs_mi.studio.live.sources import read_camera
+from tests.scenes.live_clip import connection
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
-
-
-class Connection:
-    """Delivers two images."""
-
-    def __init__(self) -> None:
-        self.left = 2
-
-    def isOpened(self) -> bool:
-        return True
-
-    def read(self) -> tuple[bool, np.ndarray]:
-        self.left -= 1
-        return self.left >= 0, IMAGE
-
-    def release(self) -> None:
-        pass
-
-
-class Missing(Connection):
-    """Cannot be opened."""
-
-    def isOpened(self) -> bool:
-        return False
 
 
 def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSE", 0)
     monkeypatch.setattr(module, "RETRY", 0)
-    opened = []
-
-    def open_stream(source: str, *_: object) -> Connection:
-        opened.append(source)
-        return Missing() if len(opened) == 2 else Connection()
-
-    monkeypatch.setattr(cv2, "VideoCapture", open_stream)
     url = "rtsp://10.0.0.10/live"
+    missing = connection(opens=False)
+    opens = Mock(side_effect=[connection(IMAGE, IMAGE), missing, connection(IMAGE, IMAGE)])
+    monkeypatch.setattr(cv2, "VideoCapture", opens)
     images = list(islice(read_camera(url, Event()), 16))
     assert sum(image is not None for image in images) == 4
-    assert opened == [url] * 3
+    assert [call.args[0] for call in opens.call_args_list] == [url] * 3
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: connection(IMAGE, IMAGE))
     for once in (read_camera(url, Event(), reconnect=False), read_camera("cam.sdp", Event())):
         assert sum(image is not None for image in once) == 2
     closed = Event()
@@ -66,30 +41,16 @@ def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.Monkey
 def test_read_camera__requests_the_size_of_a_camera_of_this_machine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    requested = {}
-
-    class Camera:
-        def isOpened(self) -> bool:
-            return True
-
-        def set(self, key: int, value: float) -> None:
-            requested[key] = value
-
-        def read(self):
-            return True, IMAGE + np.array([1, 2, 3], np.uint8)
-
-        def release(self) -> None:
-            requested["released"] = True
-
-    monkeypatch.setattr(cv2, "VideoCapture", lambda source: Camera())
+    camera = connection(IMAGE + np.array([1, 2, 3], np.uint8))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source: camera)
     images = read_camera(0, Event(), (640, 480))
     image = next(images)
     assert image is not None
     assert image[0, 0].tolist() == [3, 2, 1], "RGB"
     assert isinstance(images, Generator)
     images.close()
-    assert requested == {
-        cv2.CAP_PROP_FRAME_WIDTH: 640,
-        cv2.CAP_PROP_FRAME_HEIGHT: 480,
-        "released": True,
-    }
+    assert camera.set.call_args_list == [
+        call(cv2.CAP_PROP_FRAME_WIDTH, 640),
+        call(cv2.CAP_PROP_FRAME_HEIGHT, 480),
+    ]
+    camera.release.assert_called()

@@ -68,17 +68,17 @@ def test_load_tracks__visible_points_are_on_the_surfaces_and_move_as_the_motion_
         for frame in range(3):
             truth = load_truth(clip / "truth", camera.name, frame)
             pixels, depth = camera.project(tracks.points[:, frame])
-            inside = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
+            in_image = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
             visible = tracks.visible[camera.name][:, frame]
-            assert not (visible & ~inside).any()
+            assert not (visible & ~in_image).any()
             column, row = np.floor(np.clip(pixels, 0, (63, 47))).astype(int).T
             ahead = depth / truth.depth[row, column] - 1
             assert np.mean(np.abs(ahead[visible]) < 0.03) > 0.95
-            assert np.median(ahead[inside & ~visible]) > 0.01
-            centred = inside & (np.abs(pixels % 1 - 0.5).max(axis=1) < 1e-3)
+            assert np.median(ahead[in_image & ~visible]) > 0.01
+            centred = in_image & (np.abs(pixels % 1 - 0.5).max(axis=1) < 1e-3)
             centred &= np.abs(depth - truth.depth[row, column]) < 1e-4
             np.testing.assert_array_equal(truth.ids[row, column][centred], tracks.ids[centred])
-            counts += visible.sum(), (inside & ~visible).sum(), 0
+            counts += visible.sum(), (in_image & ~visible).sum(), 0
             if frame:
                 motion = pixels - camera.project(tracks.points[:, frame - 1])[0]
                 expected = truth.motion[row, column]
