@@ -17,7 +17,7 @@ import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.points import SharedFeatures, match_capture
-from morgs_mi.capture.truth import GroundTruth, save_truth
+from morgs_mi.capture.truth import GroundTruth, Tracks, save_tracks, save_truth
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import to_uint8
@@ -66,27 +66,23 @@ def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     stream.
     """
     folder = tmp_path_factory.mktemp("clip")
-    write_colmap(folder / "capture" / "sparse", CAMERAS)
+    capture = folder / "capture"
+    write_colmap(capture / "sparse", CAMERAS)
     for camera in CAMERAS:
         images = [rasterize(moved(t), camera) for t in range(FRAMES)]
-        write_video(
-            folder / "capture" / camera.name, [to_uint8(np.array(i.color)) for i in images], 25
-        )
+        write_video(capture / camera.name, [to_uint8(np.array(i.color)) for i in images], 25)
         for t, image in enumerate(images):
             covered = np.array(image.alpha)[..., 0] > 0
             motion = covered[..., None] * np.float32([PIXELS, 0]) * (t > 0)
             truth = GroundTruth(
                 motion, np.float32(DISTANCE * covered), np.where(covered, 0, -1), covered
             )
-            save_truth(folder / "capture" / "truth", camera.name, t, truth)
+            save_truth(capture / "truth", camera.name, t, truth)
     steps = np.arange(FRAMES)[:, None] * (STEP, 0, 0)
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])
-    np.savez(
-        folder / "capture" / "truth" / "tracks.npz",
-        points=corners[:, None] + steps,
-        ids=np.zeros(3, np.int32),
-    )
-    metadata = {"capture": str(folder / "capture"), "downscale": 1, "test_view": 0}
+    tracks = Tracks(corners[:, None] + steps, np.zeros(3, np.int32), {})
+    save_tracks(capture / "truth", tracks)
+    metadata = {"capture": str(capture), "downscale": 1, "test_view": 0}
     write_stream(folder / "stream.morgs", metadata)
     rows = [{"frame": t, "seconds": 3.0 - t} for t in range(FRAMES)]
     (folder / "report.json").write_text(json.dumps({"frames": rows}))

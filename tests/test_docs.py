@@ -35,33 +35,19 @@ def resolve(path: str) -> Any:
     Raises:
         AttributeError: it does not exist.
     """
-    names = path.split(".")
-    for count in range(len(names), 0, -1):
-        try:
-            value: Any = importlib.import_module(".".join(names[:count]))
-        except ModuleNotFoundError:
-            continue
-        for name in names[count:]:
-            # A field without a default is no attribute of its dataclass.
-            value = (
-                None if name in getattr(value, "__dataclass_fields__", ()) else getattr(value, name)
-            )
-        return value
-    raise AttributeError(path)
+    owner, _, name = path.rpartition(".")
+    try:
+        return importlib.import_module(path)
+    except ModuleNotFoundError:
+        value = resolve(owner)
+    # A field without a default is no attribute of its dataclass.
+    return None if name in getattr(value, "__dataclass_fields__", ()) else getattr(value, name)
 
 
 def exists(path: str) -> bool:
     try:
         resolve(path)
     except AttributeError:
-        return False
-    return True
-
-
-def compiles(example: str) -> bool:
-    try:
-        compile(example, "example", "exec")
-    except SyntaxError:
         return False
     return True
 
@@ -76,26 +62,18 @@ def test_equation_table__has_every_equation():
 
 
 def test_equation_table__functions_name_their_equation():
-    def named(name: str) -> set[str]:
+    for number, name in EQUATIONS:
         # "eq. 12", or a list such as "eqs. 3, 8 and 12".
-        lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", inspect.getsource(resolve(name)))
-        return {number for text in lists for number in re.findall(r"\d+", text)}
-
-    assert [
-        f"{name} does not name eq. {number}"
-        for number, name in EQUATIONS
-        if number not in named(name)
-    ] == []
+        source = inspect.getsource(resolve(name))
+        lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", source)
+        assert number in re.findall(r"\d+", " ".join(lists)), f"{name} does not name eq. {number}"
 
 
 def test_architecture__lists_every_subpackage():
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", PAGES["docs/architecture.md"], re.MULTILINE)
-    listed = {name for row in rows for name in re.findall(r"\w+", row)}
-    modules = [
-        *pkgutil.iter_modules(morgs_mi.__path__),
-        *pkgutil.iter_modules(morgs_mi.studio.__path__),
-    ]
-    assert listed == {module.name for module in modules} - {"__main__"}
+    folders = [*morgs_mi.__path__, *morgs_mi.studio.__path__]
+    names = {module.name for module in pkgutil.iter_modules(folders)}
+    assert set(re.findall(r"\w+", " ".join(rows))) == names - {"__main__"}
 
 
 def test_pages__name_only_what_exists():
@@ -108,30 +86,20 @@ def test_pages__name_only_what_exists():
 
 def test_pages__link_only_to_what_exists():
     def missing(page: str, text: str) -> list[str]:
-        targets = re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
-        local = {
-            target.partition("#")[0]
-            for target in targets
-            if not re.match(r"https?://|mailto:|#", target)
-        }
-        return [
-            target for target in sorted(local) if not (ROOT / page).parent.joinpath(target).exists()
-        ]
+        prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+        targets = set(re.findall(r"\]\((?!https?://|mailto:|#)([^)\s#]+)", prose))
+        folder = (ROOT / page).parent
+        return [target for target in sorted(targets) if not (folder / target).exists()]
 
     assert offenders(PAGES, missing) == {}
 
 
 def test_pages__examples_compile():
-    def broken(_: str, text: str) -> list[str]:
+    for text in PAGES.values():
         # A fragment that is inserted after a line is no module; tests/test_extending.py runs it.
-        text = re.sub(r"<!-- after [^\n]*-->\n```python\n.*?```", "", text, flags=re.DOTALL)
-        return [
-            example
-            for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-            if not compiles(example)
-        ]
-
-    assert offenders(PAGES, broken) == {}
+        modules = re.sub(r"<!-- after [^\n]*-->\n```python\n.*?```", "", text, flags=re.DOTALL)
+        for example in re.findall(r"```python\n(.*?)```", modules, re.DOTALL):
+            compile(example, "example", "exec")
 
 
 def test_user_pages__hold_no_measurements():

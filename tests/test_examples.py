@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import morgs_mi
+from morgs_mi.method import objective
+from morgs_mi.method.method_registry import Registry
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
@@ -43,15 +45,9 @@ def test_examples__are_short():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIZES)
 def test_examples__write_a_picture(name, tmp_path, monkeypatch):
-    if name == "own_loss":  # which registers a term for the whole process
-        from morgs_mi.method import objective
-        from morgs_mi.method.method_registry import Registry
-
-        monkeypatch.setattr(
-            objective,
-            "LOSS_TERMS",
-            Registry("ObjectiveConfig()", "terms", objective.ObjectiveConfig),
-        )
+    # `own_loss` registers a term for the whole process.
+    registry = Registry("ObjectiveConfig()", "terms", objective.ObjectiveConfig)
+    monkeypatch.setattr(objective, "LOSS_TERMS", registry)
     picture = run(name, tmp_path / "picture.png")
     assert picture.shape == (*reversed(SIZES[name]), 3)
     assert picture.std() > 5

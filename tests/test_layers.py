@@ -42,46 +42,28 @@ ENTRY_POINTS = {ROOT / "__init__.py", ROOT / "__main__.py"}
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path not in ENTRY_POINTS)
 
 
-def subpackage_of(path: Path) -> str:
-    return path.relative_to(ROOT).parts[0].removesuffix(".py")
-
-
-def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
-    """Return the dotted names that the module imports, relative ones resolved against `package`."""
-    names: list[list[str]] = []
-    for node in ast.walk(tree):
+def imported_names(path: Path) -> set[str]:
+    """Return the names that a module imports from the package, by their first part."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            names += [alias.name.split(".") for alias in node.names]
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            base = base + (node.module.split(".") if node.module else [])
-            names += [[*base, alias.name] for alias in node.names]
-    return names
+            assert not node.level, f"{path}: expected absolute imports"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name.split(".")[1] for name in names if name.startswith("morgs_mi.")}
 
 
 def mistakes(path: Path) -> list[str]:
     """Return a line for each of the module's imports from a later subpackage."""
-    subpackage = subpackage_of(path)
-    place = path.relative_to(ROOT)
+    subpackage = path.relative_to(ROOT).parts[0].removesuffix(".py")
     if subpackage not in SUBPACKAGES:
-        return [f"{place}: add {subpackage} to SUBPACKAGES, after all that it imports"]
-    names = imported_names(
-        ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts]
-    )
-    subpackages = sorted({name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1})
-    successors = SUBPACKAGES[SUBPACKAGES.index(subpackage) + 1 :]
+        return [f"{path}: add {subpackage} to SUBPACKAGES, after all that it imports"]
+    # A name imported from `morgs_mi` itself would hide its subpackage.
     return [
-        *(
-            f"{place} imports from {name}, which comes after {subpackage}"
-            for name in subpackages
-            if name in successors
-        ),
-        # A name imported from `morgs_mi` itself would hide its subpackage.
-        *(
-            f"{place} imports {name} from morgs_mi itself"
-            for name in subpackages
-            if name not in SUBPACKAGES
-        ),
+        f"{path} imports {name}, which is not among the subpackages up to {subpackage}"
+        for name in sorted(imported_names(path))
+        if name not in SUBPACKAGES[: SUBPACKAGES.index(subpackage) + 1]
     ]
 
 
@@ -90,12 +72,9 @@ def test_layers__imports_go_down():
 
 
 def test_layers__only_the_table_of_entries_names_the_studio():
-    places = [
-        path.relative_to(ROOT)
-        for path in MODULES
-        if "morgs_mi.studio" in path.read_text(encoding="utf-8")
-    ]
-    assert [place for place in places if place.parts[0] != "studio"] == [Path("core/entries.py")]
+    places = [path for path in MODULES if "morgs_mi.studio" in path.read_text(encoding="utf-8")]
+    outside = [path for path in places if not path.is_relative_to(ROOT / "studio")]
+    assert outside == [ROOT / "core/entries.py"]
 
 
 @pytest.mark.parametrize(

@@ -38,21 +38,19 @@ def test_readme__examples_run(example, workplace, monkeypatch):
     exec(compile(example, "README.md", "exec"), {})
 
 
+def result(name: str) -> dict:
+    return json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
+
+
 def test_readme__quotes_the_committed_demo():
-    report = json.loads((ROOT / "benchmarks/results/demo.json").read_text(encoding="utf-8"))
+    rows = result("demo")["comparison"]
     for name, title in (("full", "ML + MO + MC"), ("plain", "residuals only")):
-        row = report["comparison"][name]
-        figures = (
-            f"{row['psnr']:.2f} dB | {row['motion_error_moving']:.2f} px | "
-            f"{row['motion_error_still']:.2f} px"
-        )
-        assert f"| {title} | {figures} |" in README
+        errors = [f"{rows[name][f'motion_error_{part}']:.2f} px" for part in ("moving", "still")]
+        assert f"| {title} | {rows[name]['psnr']:.2f} dB | {' | '.join(errors)} |" in README
 
 
 def test_readme__quotes_the_committed_time_of_an_image():
-    rows = json.loads((ROOT / "benchmarks/results/splat_files.json").read_text(encoding="utf-8"))[
-        "rows"
-    ]
+    rows = result("splat_files")["rows"]
     seconds = {row["gaussians"]: f"{row['image_seconds']:.1f} s" for row in rows}
     sentence = (
         f"takes {seconds[100_000]} with 100,000 Gaussians and {seconds[1_000_000]} with a million, "
@@ -62,18 +60,15 @@ def test_readme__quotes_the_committed_time_of_an_image():
 
 
 def test_readme__names_commands_that_exist():
-    named = set(re.findall(r"^ {4}morgs-mi (\w+)", README, re.MULTILINE))
-    assert named
-    assert named <= set(COMMANDS)
+    commands = set(re.findall(r"^ {4}morgs-mi (\w+)", README, re.MULTILINE))
+    assert commands
+    assert commands <= set(COMMANDS)
+    # The commands of a new machine, of which CI runs the tests.
+    assert re.search("\n    make demo    # [^\n]+\n    make test    # [^\n]+\n", README)
+    assert "\nmake test\n" in (ROOT / ".ci/run").read_text(encoding="utf-8")
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"^ {4}make (\S+)", README, re.MULTILINE):
         assert f"\n{target}:" in makefile
-
-
-def test_readme__names_the_two_commands_of_a_new_machine_of_which_ci_runs_the_tests():
-    commands = "\n    make demo    # [^\n]+\n    make test    # [^\n]+\n"
-    assert re.search(commands, README)
-    assert "\nmake test\n" in (ROOT / ".ci/run").read_text(encoding="utf-8")
 
 
 def test_readme__is_short():
@@ -81,18 +76,12 @@ def test_readme__is_short():
 
 
 def test_readme__cites_the_paper_as_the_other_pages_do():
-    (entry,) = re.findall(r"```bibtex\n(.*?)```", README, re.DOTALL)
-    page = " ".join((ROOT / "docs/architecture.md").read_text(encoding="utf-8").split())
+    (authors,) = re.findall(r"author += \{(.*)\}", README)
+    names = [name.split(", ") for name in authors.split(" and ")]
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    (authors,) = re.findall(r"author += \{(.*)\}", entry)
-    names = [
-        f"{first_name} {family}"
-        for family, first_name in (name.split(", ") for name in authors.split(" and "))
-    ]
-    cited = zip(
-        re.findall(r"family-names: (\w+)", citation),
-        re.findall(r"given-names: (\w+)", citation),
-        strict=True,
-    )
-    assert names == [f"{first_name} {family}" for family, first_name in cited]
-    assert all(name in text for name in names for text in (page, " ".join(README.split())))
+    assert [family for family, _ in names] == re.findall(r"family-names: (\w+)", citation)
+    assert [first for _, first in names] == re.findall(r"given-names: (\w+)", citation)
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    for text in (README, page):
+        words = " ".join(text.split())
+        assert all(f"{first} {family}" in words for family, first in names)

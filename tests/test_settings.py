@@ -4,6 +4,7 @@ range is checked.
 
 from __future__ import annotations
 
+import re
 from dataclasses import astuple, fields, is_dataclass, replace
 from typing import Any, get_args
 
@@ -112,42 +113,33 @@ def other(name: str) -> Any:
 @pytest.fixture(scope="module")
 def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
     """Five views of a bright textured square in front of a textured wall; it moves, and the light
-    grows slowly.
+    grows slowly. Images have the noise of a grey level.
     """
     rng = np.random.default_rng(0)
     origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
     views = look_at_cameras(origins)
     wall = random_sheet(rng, 260, 1.5, 0.5)
     square = random_sheet(rng, 80, 0.35, -0.4)
-    points = np.concatenate([wall, square])
     colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
-    frames = [
-        [
-            image(view, wall, square + np.array((0.06 * t, 0.02 * t, 0)), colors, rng, t)
-            for view in views
-        ]
-        for t in range(4)
-    ]
-    return views, points, colors, frames
+    frames = []
+    for t in range(4):
+        moved_square = square + np.array((0.06 * t, 0.02 * t, 0))
+        images = np.stack([image(view, wall, moved_square, colors, t) for view in views])
+        noise = rng.normal(0, 1, images.shape)
+        frames.append([*np.clip(images + noise, 0, 255).astype(np.uint8)])
+    return views, np.concatenate([wall, square]), colors, frames
 
 
 def image(
-    view: Camera,
-    wall: np.ndarray,
-    square: np.ndarray,
-    colors: np.ndarray,
-    rng: np.random.Generator,
-    t: int,
+    view: Camera, wall: np.ndarray, square: np.ndarray, colors: np.ndarray, t: int
 ) -> np.ndarray:
-    """Draw the points as squares, the far ones first, with noise of a grey level."""
+    """Draw the points as squares, the far ones first, without noise."""
     drawn = np.full((48, 64, 3), 0.2)
     for points, part, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
         for (x, y), color in zip(view.project(points)[0].astype(int), part, strict=True):
-            drawn[
-                max(y - radius, 0) : max(y + radius, 0), max(x - radius, 0) : max(x + radius, 0)
-            ] = color
-    noisy = drawn * (1 + 0.01 * t) * 255 + rng.normal(0, 1, drawn.shape)
-    return np.clip(noisy, 0, 255).astype(np.uint8)
+            rows = slice(max(y - radius, 0), max(y + radius, 0))
+            drawn[rows, max(x - radius, 0) : max(x + radius, 0)] = color
+    return drawn * (1 + 0.01 * t) * 255
 
 
 def stream(clip, config: StreamConfig) -> bytes:
@@ -174,20 +166,15 @@ def bounds() -> list[tuple[Any, str, Any]]:
     """Return a config, the name of a field, and a value beyond each of its bounds, for all settings
     of a fit.
     """
-    bounds_of_fields = []
-    configs = [StreamConfig()]
+    values = []
+    configs: list[Any] = [StreamConfig()]
     for config in configs:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():
-            bounds_of_arms = [
-                bound
-                for arm in (kind, *get_args(kind))
-                for bound in getattr(arm, "__metadata__", ())
-            ]
-            bounds_of_fields += [
-                (config, name, BEYOND[type(bound)](*astuple(bound))) for bound in bounds_of_arms
-            ]
-    return bounds_of_fields
+            for arm in (kind, *get_args(kind)):
+                for bound in getattr(arm, "__metadata__", ()):
+                    values.append((config, name, BEYOND[type(bound)](*astuple(bound))))
+    return values
 
 
 BEYOND = {
@@ -201,9 +188,9 @@ BEYOND = {
 
 def test_settings__every_range_is_checked():
     for config, name, value in bounds():
-        with pytest.raises(
-            ValueError, match=rf"^{type(config).__name__}\(\): `{name}` must be "
-        ) as caught:
+        place = (
+            rf"^{type(config).__name__}\(\): `{name}` must be .*, got {re.escape(str(value))}\.$"
+        )
+        with pytest.raises(ValueError, match=place):
             replace(config, **{name: value})
-        assert str(caught.value).endswith(f", got {value}.")
     assert len(bounds()) > 60
