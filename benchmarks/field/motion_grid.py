@@ -13,8 +13,7 @@ Motion that the images hardly need becomes 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from math import log
 
 import drjit as dr
@@ -22,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
-from benchmarks.field.shared import corners, quantised
+from benchmarks.field.shared import CELLS, RATES, corners, quantised
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.types import Float, Tensor
@@ -36,44 +35,31 @@ from morgs_mi.method.motion_model import (
 
 # Least probability of a value, which bounds its bits.
 _LEAST = 1e-6
-
-
-@dataclass(frozen=True)
-class GridConfig:
-    """Settings of the motion grid."""
-
-    cells: tuple[float, ...] = (0.4, 0.2, 0.1, 0.05)
-    """Side of the cells of each level, in scene extents."""
-    translation_step: float = 1e-4
-    """Step of the translations, in scene extents."""
-    rotation_step: float = 1e-3
-    """Step of the rotations."""
-    translation_rate: float = 4e-3
-    """Learning rate of the translations at the start, in scene extents; it falls to a tenth."""
-    rotation_rate: float = 8e-3
-    """Learning rate of the rotations, likewise."""
-    scale: float = 4.0
-    """Scale b at the start, in steps."""
-    scale_rate: float = 0.05
-    """Learning rate of the logarithms of the scales."""
-    rate_weight: float = 1e-4
-    """Weight of the bits per Gaussian."""
-
-
+# Steps: of translations in scene extents, and of rotations.
+_STEPS = {"translation": 1e-4, "rotation": 1e-3}
+# Scale b at the start, in steps, and the learning rate of its logarithm.
+_SCALE = 4.0
+_SCALE_RATE = 0.05
+# Weight of the bits per Gaussian.
+_RATE_WEIGHT = 1e-4
 # Beside the default, most motion is known when the grid begins.
-_SLOW = GridConfig(translation_rate=5e-4, rotation_rate=2e-3)
+_SLOW = {"translation": 5e-4, "rotation": 2e-3}
 
 
-def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> MotionModel:
-    """Return the model of N Gaussians of the previous frame; `extent` of the scene, world units."""
-    matrix, level = corner_matrix(
-        np.asarray(gaussians.means), [side * extent for side in config.cells]
-    )
-    C = len(level)
+def motion_grid(gaussians: Gaussians, extent: float, rates: Mapping[str, float]) -> MotionModel:
+    """Return the model of N Gaussians of the previous frame.
+
+    Args:
+        gaussians: of the previous frame.
+        extent: of the scene, world units.
+        rates: learning rates of the translations, in scene extents, and of the rotations.
+    """
     N = len(gaussians)
-    L = len(config.cells)
+    L = len(CELLS)
+    matrix, level = corner_matrix(np.asarray(gaussians.means), extent)
+    C = len(level)
     of_level = csr_array((np.ones(C, np.float32), level, np.arange(C + 1)), (C, L))
-    steps = {"translation": config.translation_step * extent, "rotation": config.rotation_step}
+    steps = _STEPS | {"translation": _STEPS["translation"] * extent}
 
     def motion(p: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         return tuple(
@@ -87,19 +73,15 @@ def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> Moti
             dr.sum(bits(p[name].array, repeat_each(b, int(p[name].shape[1]))))
             for name, b in of_kind
         )
-        return {"rate": total * (config.rate_weight / N)}
+        return {"rate": total * (_RATE_WEIGHT / N)}
 
     return MotionModel(
         {
             "translation": dr.zeros(mi.TensorXf, (C, 3)),
             "rotation": dr.zeros(mi.TensorXf, (C, 4)),
-            "log_scales": dr.full(mi.TensorXf, log(config.scale), (L, 2)),
+            "log_scales": dr.full(mi.TensorXf, log(_SCALE), (L, 2)),
         },
-        {
-            "translation": config.translation_rate / config.translation_step,
-            "rotation": config.rotation_rate / config.rotation_step,
-            "log_scales": config.scale_rate,
-        },
+        {**{name: rates[name] / step for name, step in _STEPS.items()}, "log_scales": _SCALE_RATE},
         motion,
         rate,
     )
@@ -107,7 +89,7 @@ def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> Moti
 
 @MOTION_MODELS.register("grid")
 def _grid(argument: str, config: MotionConfig) -> MotionModelFactory:
-    return lambda gaussians, extent, rng: motion_grid(gaussians, extent, GridConfig())
+    return lambda gaussians, extent, rng: motion_grid(gaussians, extent, RATES)
 
 
 @MOTION_MODELS.register("grid-slow")
@@ -121,20 +103,15 @@ def bits(x: Float, scale: Float) -> Float:
     return dr.log2(dr.maximum(probability, _LEAST)) * -1.0
 
 
-def corner_matrix(points: np.ndarray, sides: Sequence[float]) -> tuple[csr_array, np.ndarray]:
-    """Return the weights [N, C] of the corners around points [N, 3], on all levels, and the level
-    of each corner [C].
-
-    Args:
-        points: world units.
-        sides: of the cells of each level, world units.
+def corner_matrix(points: np.ndarray, extent: float) -> tuple[csr_array, np.ndarray]:
+    """Return the weights [N, C] of the corners around points [N, 3] on all levels, and the level
+    of each corner [C]; `extent` of the scene in world units.
     """
     matrices = []
-    for side in sides:
-        corner, weights = corners(points, side)
+    for side in CELLS:
+        corner, weights = corners(points, side * extent)
         _, index = np.unique(corner.reshape(-1, 3), axis=0, return_inverse=True)
-        matrices.append(
-            csr_array((weights.ravel(), index.ravel(), np.arange(0, 8 * len(points) + 1, 8)))
-        )
-    levels = np.repeat(np.arange(len(sides)), [matrix.shape[1] for matrix in matrices])
+        starts = np.arange(0, 8 * len(points) + 1, 8)
+        matrices.append(csr_array((weights.ravel(), index.ravel(), starts)))
+    levels = np.repeat(np.arange(len(CELLS)), [matrix.shape[1] for matrix in matrices])
     return csr_array(hstack(matrices, format="csr")), levels

@@ -16,7 +16,7 @@ a radial distortion of up to that (k1), of which the calibration knows nothing.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -103,9 +103,18 @@ class Options(StudyOptions):
             if not group:
                 continue
             psnrs = (f"{np.mean([row[rig]['registered'] for row in group]):.1f}" for rig in _RIGS)
-            shares = f"{span((100 * recovered(row) for row in group), 0)} %"
+            shares = []
+            for row in group:
+                best, worst, result = (row[rig]["registered"] for rig in _RIGS)
+                is_lost = (row["degrees"] or row["lens"]) and best != worst
+                shares.append(100 * (result - worst) / (best - worst) if is_lost else np.nan)
             lines.append(
-                (name, *psnrs, shares, span((row["refined"]["rotation"] for row in group), 2))
+                (
+                    name,
+                    *psnrs,
+                    f"{span(shares, 0)} %",
+                    span((row["refined"]["rotation"] for row in group), 2),
+                )
             )
         titles = "true cameras, dB", "disturbed", "refined", "recovered", "rotation after, degrees"
         return markdown(("error", *titles), lines)
@@ -116,25 +125,25 @@ def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Cam
     rng = np.random.default_rng([seed, 7])
     extent = scene_extent(cameras)
     result = []
-    focal = _FOCAL_ERROR if degrees else 0.0
     for camera in cameras:
         axis, direction = rng.normal(size=(2, 3))
         rotation = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
         displacement = degrees / 100 * extent * direction / np.linalg.norm(direction)
-        result.append(
-            changed_camera(
-                camera, np.array([*rotation, *displacement, focal * rng.choice([-1, 1]), 0, 0])
-            )
-        )
+        change = [*rotation, *displacement, _FOCAL_ERROR * rng.choice([-1, 1]), 0, 0]
+        result.append(changed_camera(camera, np.array(change)))
     return tuple(result)
 
 
-def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, float]:
-    """Return the mean error of the rotations after the best common one, degrees."""
-    pairs = list(zip(cameras, true, strict=True))
-    U, _, Vt = np.linalg.svd(sum(a.viewmat[:3, :3].T @ b.viewmat[:3, :3] for a, b in pairs))
-    turns = [cv2.Rodrigues(a.viewmat[:3, :3] @ U @ Vt @ b.viewmat[:3, :3].T)[0] for a, b in pairs]
-    return {"rotation": float(np.rad2deg([np.linalg.norm(turn) for turn in turns]).mean())}
+def rotation_error(rig: Capture, true: Capture) -> float:
+    """Return the mean error of the rotations of the training cameras after the best common one,
+    degrees.
+    """
+    pairs = [
+        (rig.cameras[v].viewmat[:3, :3], true.cameras[v].viewmat[:3, :3]) for v in true.train_views
+    ]
+    U, _, Vt = np.linalg.svd(sum(a.T @ b for a, b in pairs))
+    turns = [cv2.Rodrigues(a @ U @ Vt @ b.T)[0] for a, b in pairs]
+    return float(np.rad2deg([np.linalg.norm(turn) for turn in turns]).mean())
 
 
 def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
@@ -147,11 +156,8 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     assert gaussians is not None
     view = View(capture.cameras[test], images[test], capture.masks[test])
     camera = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
-    views = {
-        "calibrated": [view],
-        "registered": [view._replace(camera=camera)],
-    }
-    return {name: mean_psnr(gaussians, group, config.render) for name, group in views.items()}
+    views = {"calibrated": view, "registered": view._replace(camera=camera)}
+    return {name: mean_psnr(gaussians, [each], config.render) for name, each in views.items()}
 
 
 def measure(
@@ -171,16 +177,10 @@ def measure(
     better, refinement = refine_cameras(wrong, config.fit, config.render, config.seed)
     return {
         "true": scores(capture, config),
-        "disturbed": scores(wrong, config) | camera_errors(wrong, capture),
-        "refined": scores(better, config) | camera_errors(better, capture),
+        "disturbed": scores(wrong, config) | {"rotation": rotation_error(wrong, capture)},
+        "refined": scores(better, config) | {"rotation": rotation_error(better, capture)},
         "refinement": asdict(refinement),
     }
-
-
-def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
-    """Return the errors of the training cameras."""
-    train = capture.train_views
-    return pose_errors([given.cameras[v] for v in train], [capture.cameras[v] for v in train])
 
 
 def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
@@ -202,16 +202,6 @@ def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
             denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses
         )
     return path, denied
-
-
-def recovered(row: Mapping[str, Any]) -> float:
-    """Return the share of the lost PSNR of the registered view that refinement brings back; NaN of
-    true cameras.
-    """
-    if not row["degrees"] and not row["lens"]:
-        return float("nan")
-    best, worst, result = (row[name]["registered"] for name in ("true", "disturbed", "refined"))
-    return (result - worst) / (best - worst) if best != worst else float("nan")
 
 
 if __name__ == "__main__":

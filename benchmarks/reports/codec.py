@@ -19,6 +19,7 @@ import lzma
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from morgs_mi.runs.fit_capture import stream_capture
 _LZMA_PRESET = 6
 # Quality of the stream that serves as the uncompressed reference.
 _REFERENCE = 1000
+_LABELS = "stream", "lzma over float32 residuals"
 COLUMNS = (
     Column("PSNR, dB", lambda row: row["psnr"]["later"], spread=False),
     Column("loss, dB", lambda row: round(row["loss"], 2) + 0.0, spread=False),
@@ -87,8 +89,24 @@ def measure(capture: Capture, options: Options) -> dict[str, Any]:
         folder = options.out / name / f"{quality:g}"
         stream_capture(capture, folder, config)
         print(f"{name} at quality {quality:g}", flush=True)
-        figures = _evaluated(folder, capture) | _measured(folder, config)
-        rows.append({"quality": quality, **figures})
+        later_frames = evaluate_stream(folder, capture.path).frames[1:]
+        stream = open_stream(folder)
+        frames = [
+            _frame(old_state, state, stream.cameras, config)
+            for old_state, state in pairwise(coded_frames(stream))
+        ]
+        times = {
+            key: float(np.median([row[key] for row in frames])) for key in ("encode_ms", "lzma_ms")
+        }
+        rows.append(
+            {
+                "quality": quality,
+                "psnr": {"later": float(np.mean([row.scores.psnr for row in later_frames]))},
+                "later": float(np.mean([row.num_bytes for row in later_frames])),
+                "lzma": float(np.mean([row["lzma"] for row in frames])),
+                **times,
+            }
+        )
     best = rows[-1]["psnr"]["later"]
     return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
 
@@ -107,57 +125,27 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
         ValueError: matplotlib is not installed.
     """
     figure = blank_figure(10, 3.8 * len(clips))
-    for (left, right), clip in zip(
-        figure.subplots(len(clips), 2, squeeze=False), clips, strict=True
-    ):
+    grid = figure.subplots(len(clips), 2, squeeze=False)
+    for (left, right), clip in zip(grid, clips, strict=True):
         rows = clip["rows"]
-        stream_sizes, lzma_sizes = (
-            1e-3 * np.array(column)
-            for column in zip(*((r["later"], r["lzma"]) for r in rows), strict=True)
-        )
-        psnr = [row["psnr"]["later"] for row in rows]
-        times = [row["encode_ms"] for row in rows], [row["lzma_ms"] for row in rows]
-        for axis, (stream_values, lzma_values) in ((left, (psnr, psnr)), (right, times)):
-            axis.plot(stream_sizes, stream_values, "o-", label="stream")
-            axis.plot(lzma_sizes, lzma_values, "s--", label="lzma over float32 residuals")
+        for axis, scores in ((left, ("psnr", "psnr")), (right, ("encode_ms", "lzma_ms"))):
+            names = zip(("later", "lzma"), scores, ("o-", "s--"), _LABELS, strict=True)
+            for size, score, style, label in names:
+                x = [1e-3 * row[size] for row in rows]
+                y = [row[score]["later"] if score == "psnr" else row[score] for row in rows]
+                axis.plot(x, y, style, label=label)
+                if size == "later":
+                    texts = [f"{row['quality']:g}" for row in rows]
+                    label_points(axis, zip(x, y, strict=True), texts, (4, -12), 8)
             axis.set(xscale="log", xlabel="kB per later frame")
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="minor", labelsize=6, rotation=45)
-            points = zip(stream_sizes, stream_values, strict=True)
-            label_points(axis, points, [f"{row['quality']:g}" for row in rows], (4, -12), 8)
         left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality")
-        right.set(
-            ylabel="ms to encode a frame", yscale="log", title=f"{clip['name']}: encoding time"
-        )
+        title = f"{clip['name']}: encoding time"
+        right.set(ylabel="ms to encode a frame", yscale="log", title=title)
         left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
     save_figure(figure, path)
-
-
-def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Return the quality and the bytes of the decoded stream."""
-    evaluation = evaluate_stream(folder, capture.path)
-    later_frames = evaluation.frames[1:]
-    return {
-        "psnr": {"later": float(np.mean([row.scores.psnr for row in later_frames]))},
-        "later": float(np.mean([row.num_bytes for row in later_frames])),
-    }
-
-
-def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
-    """Return times and bytes of encoding the later frames again, with the codec and with lzma."""
-    stream = open_stream(folder)
-    cameras = stream.cameras
-    rows = []
-    old_state = None
-    for state in coded_frames(stream):
-        if old_state is not None:
-            rows.append(_frame(old_state, state, cameras, settings))
-        old_state = state
-    medians = {
-        name: float(np.median([row[name] for row in rows])) for name in ("encode_ms", "lzma_ms")
-    }
-    return {"lzma": float(np.mean([row["lzma"] for row in rows])), **medians}
 
 
 def _frame(

@@ -11,7 +11,7 @@ whole clip, all against the exact ground truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
-from benchmarks.reports.fits import DEFAULT, Clip, random_capture
+from benchmarks.reports.fits import DEFAULT, Clip, new_loop, random_capture
 from benchmarks.reports.plots import Column, blank_figure, means_over, save_figure, scores_table
 from benchmarks.reports.tracks import track_scores
 from benchmarks.speed.output import Output
@@ -29,8 +29,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.config import apply_values
 from morgs_mi.core.files import json_finite
-from morgs_mi.evaluate.results import Evaluation, known_mean
-from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.evaluate.results import known_mean
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 
 _FAST = {"fit": {"rates": {"means": 2e-3}}}
@@ -122,39 +121,27 @@ class Options(Output):
 def measure(capture: Capture, methods: Mapping[str, StreamConfig]) -> dict[str, dict[str, Any]]:
     """Fit a clip by each method after the same first frame and return the scores by method."""
     clip = Clip.read(capture)
-    loop = clip.loop(next(iter(methods.values())))
-    keyframe, _ = loop.push(clip.images[0])
-    scores = {}
+    keyframe, _ = new_loop(capture, next(iter(methods.values()))).push(clip.images[0])
+    rows = {}
     for method, config in methods.items():
         fit = clip.continued(keyframe, config)
-        tracks = track_scores(coded_frames(fit.packets), clip.capture, config.render)
-        scores[method] = scores_of(fit.evaluation, tracks, fit.reports, fit.seconds)
-    return scores
+        tracks = track_scores(coded_frames(fit.packets), capture, config.render)
+        later_frames = fit.evaluation.frames[1:]
+        series = {n: [getattr(row.scores, n) for row in later_frames] for n in _SCORES}
+        scores = {
+            **{name: known_mean(values) for name, values in series.items()},
+            **{f"{_PROTOCOL} {name}": value for name, value in tracks.items()},
+            "num_bytes": known_mean([report.num_bytes for report in fit.reports]),
+            "cpu_s": known_mean(fit.seconds),
+        }
+        figures = {name: _rounded(value) for name, value in scores.items()}
+        by_frame = {name: [_rounded(v) for v in values] for name, values in series.items()}
+        rows[method] = json_finite({**figures, "by_frame": by_frame})
+    return rows
 
 
-def scores_of(
-    found: Evaluation,
-    tracks: Mapping[str, float],
-    reports: Sequence[FrameReport],
-    seconds: Sequence[float],
-) -> dict[str, Any]:
-    """Return the scores of a stream as JSON."""
-    later_frames = found.frames[1:]
-    scores = {
-        **{
-            name: known_mean([getattr(row.scores, name) for row in later_frames])
-            for name in _SCORES
-        },
-        **{f"{_PROTOCOL} {name}": value for name, value in tracks.items()},
-        "num_bytes": known_mean([report.num_bytes for report in reports]),
-        "cpu_s": known_mean(seconds),
-    }
-    figures = {name: float(f"{value:.4g}") for name, value in scores.items()}
-    series = {
-        name: [float(f"{getattr(row.scores, name):.4g}") for row in later_frames]
-        for name in _SCORES
-    }
-    return json_finite({**figures, "by_frame": series})
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
 
 
 Cells = Mapping[str, Mapping[str, Mapping[str, Any]]]

@@ -5,7 +5,6 @@ fits.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -81,11 +80,9 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     )
 
 
-def new_loop(
-    capture: Capture, config: StreamConfig, train: Sequence[int] | None = None
-) -> StreamLoop:
-    """Return a loop over the views `train` of a capture, its training views if they are None."""
-    train = capture.train_views if train is None else train
+def new_loop(capture: Capture, config: StreamConfig) -> StreamLoop:
+    """Return a loop over the training views of a capture."""
+    train = capture.train_views
     cameras = [capture.cameras[v] for v in train]
     masks = [capture.masks[v] for v in train]
     return StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
@@ -93,48 +90,30 @@ def new_loop(
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A capture with its images in memory.
-
-    Attributes:
-        capture: the recording.
-        images: images by frame and training view, uint8 [H, W, 3].
-    """
+    """A capture with its images in memory."""
 
     capture: Capture
-    images: tuple[tuple[np.ndarray, ...], ...]
+    images: tuple[tuple[np.ndarray, ...], ...]  # by frame and training view, uint8 [H, W, 3]
 
     @classmethod
     def read(cls, capture: Capture) -> Clip:
         """Return a capture with its images decoded."""
-        return cls(
-            capture,
-            tuple(tuple(f.images[v] for v in capture.train_views) for f in capture.frames()),
-        )
-
-    def loop(self, config: StreamConfig) -> StreamLoop:
-        """Return a loop on the training views, before its first frame."""
-        return new_loop(self.capture, config)
-
-    def writer(self, path: Path, config: StreamConfig) -> StreamWriter:
-        """Return a writer of a new stream of this clip."""
-        metadata = {
-            "capture": str(self.capture.path.resolve()),
-            "downscale": self.capture.downscale,
-        }
-        metadata |= {"test_view": list(self.capture.test_views), "config": asdict(config)}
-        return StreamWriter(path, self.capture.cameras, self.capture.fps, metadata)
+        frames = capture.frames()
+        return cls(capture, tuple(tuple(f.images[v] for v in capture.train_views) for f in frames))
 
     def continued(self, keyframe: Packet, config: StreamConfig) -> Continuation:
         """Fit all later frames after the packet of the first one."""
-        (state,) = coded_frames([keyframe])
-        loop = self.loop(config)
-        loop.resume(state, self.images[:1])
+        capture = self.capture
+        metadata = {"capture": str(capture.path.resolve()), "downscale": capture.downscale}
+        metadata |= {"test_view": list(capture.test_views), "config": asdict(config)}
+        loop = new_loop(capture, config)
+        loop.resume(*coded_frames([keyframe]), self.images[:1])
         packets = [keyframe]
         reports = []
         seconds = []
         with TemporaryDirectory() as folder:
             path = Path(folder) / "stream.morgs"
-            with self.writer(path, config) as writer:
+            with StreamWriter(path, capture.cameras, capture.fps, metadata) as writer:
                 writer.write(keyframe)
                 for images in self.images[1:]:
                     start = time.process_time()
@@ -143,21 +122,14 @@ class Clip:
                     writer.write(packet)
                     packets.append(packet)
                     reports.append(report)
-            evaluation = evaluate_stream(path, self.capture.path)
-            return Continuation(evaluation, packets, reports, seconds)
+            evaluation = evaluate_stream(path, capture.path)
+        return Continuation(evaluation, packets, reports, seconds)
 
 
 class Continuation(NamedTuple):
-    """The later frames of a clip.
+    """The later frames of a clip."""
 
-    Attributes:
-        evaluation: scores of the whole stream.
-        packets: of all frames.
-        reports: of the later frames.
-        seconds: processor times of the later frames, s.
-    """
-
-    evaluation: Evaluation
-    packets: list[Packet]
-    reports: list[FrameReport]
-    seconds: list[float]
+    evaluation: Evaluation  # of the whole stream
+    packets: list[Packet]  # of all frames
+    reports: list[FrameReport]  # of the later frames
+    seconds: list[float]  # processor times of the later frames, s

@@ -24,6 +24,9 @@ from morgs_mi.core.bounded import read_json
 
 # Frames of a table over time at equal distances, besides the first residual.
 _ROWS = 3
+_SCORES = ("psnr", "psnr_matched", "psnr_moving", "psnr_still")
+# Decimals, factor and unit of the cells of that table.
+_CELLS = (*[(2, 1, "")] * 4, (0, 100, " %"), (0, 1e-3, ""), (1, 1, ""))
 
 
 @dataclass(frozen=True)
@@ -48,28 +51,22 @@ def scores_of(out: Path) -> dict[str, Any]:
     result = read_json(out / "eval.json")
     report = read_json(out / "report.json")
     first = report["frames"][0]
-    frames = result["frames"]
+    frames = []
+    for frame, row in zip(result["frames"], report["frames"], strict=True):
+        scores = {name: frame[name] for name in _SCORES}
+        scores |= {"active": row["active"].get("gaussians"), "seconds": row["seconds"]}
+        rounded = {n: None if v is None else round(v, 3) for n, v in scores.items()}
+        frames.append(rounded | {"num_bytes": row["num_bytes"]})
     return {
         "recording": out.name,
         "training_views": len(report["train_views"]),
         "gaussians": first["num_gaussians"],
         "is_balanced": bool(first["validation"].get("exposure", {}).get("taken", False)),
         "views": {
-            name: {key: round(scores[key], 3) for key in ("psnr", "psnr_matched")}
-            for name, scores in frames[0]["views"].items()
+            name: {key: round(scores[key], 3) for key in _SCORES[:2]}
+            for name, scores in result["frames"][0]["views"].items()
         },
-        "frames": [
-            {
-                "psnr": _rounded(frame["psnr"]),
-                "psnr_matched": _rounded(frame["psnr_matched"]),
-                "psnr_moving": _rounded(frame["psnr_moving"]),
-                "psnr_still": _rounded(frame["psnr_still"]),
-                "active": _rounded(row["active"].get("gaussians")),
-                "num_bytes": row["num_bytes"],
-                "seconds": _rounded(row["seconds"]),
-            }
-            for frame, row in zip(frames, report["frames"], strict=True)
-        ],
+        "frames": frames,
     }
 
 
@@ -79,14 +76,12 @@ def first_frames(fits: Sequence[dict[str, Any]]) -> str:
     """
     rows = []
     for fit in fits:
-        balance = "yes" if fit["is_balanced"] else "no"
         views = fit["views"].values()
-        cells = f"{fit['training_views']}", f"{fit['gaussians']:,}", balance
+        cells = f"{fit['training_views']}", f"{fit['gaussians']:,}"
+        balance = "yes" if fit["is_balanced"] else "no"
         psnrs = ", ".join(f"{scores['psnr']:.1f}" for scores in views)
-        means = (
-            f"{np.mean([scores[key] for scores in views]):.2f}" for key in ("psnr", "psnr_matched")
-        )
-        rows.append((fit["recording"], *cells, psnrs, *means))
+        means = (f"{np.mean([scores[key] for scores in views]):.2f}" for key in _SCORES[:2])
+        rows.append((fit["recording"], *cells, balance, psnrs, *means))
     titles = "training views", "Gaussians", "balanced", "held-out views, dB", "mean", "matched"
     return markdown(("recording", *titles), rows, left=1)
 
@@ -94,31 +89,18 @@ def first_frames(fits: Sequence[dict[str, Any]]) -> str:
 def later_frames(fits: Sequence[dict[str, Any]]) -> str:
     """Return the scores of some frames of the recordings that have several."""
     rows = []
-    for fit in fits:
-        frames = fit["frames"]
-        if len(frames) == 1:
-            continue
-        for index in sorted({0, 1, *np.linspace(0, len(frames) - 1, _ROWS, dtype=int).tolist()}):
-            frame = frames[index]
-            scores = (
-                _cell(frame[key], 2)
-                for key in ("psnr", "psnr_matched", "psnr_moving", "psnr_still")
+    for fit in (fit for fit in fits if len(fit["frames"]) > 1):
+        last = len(fit["frames"]) - 1
+        for index in sorted({0, 1, *np.linspace(0, last, _ROWS, dtype=int).tolist()}):
+            frame = fit["frames"][index]
+            values = [frame[key] for key in (*_SCORES, "active", "num_bytes", "seconds")]
+            cells = (
+                "" if value is None else f"{factor * value:.{digits}f}{unit}"
+                for value, (digits, factor, unit) in zip(values, _CELLS, strict=True)
             )
-            active = "" if frame["active"] is None else f"{100 * frame['active']:.0f} %"
-            size = f"{frame['num_bytes'] / 1e3:.0f}"
-            rows.append(
-                (fit["recording"], f"{index}", *scores, active, size, _cell(frame["seconds"], 1))
-            )
+            rows.append((fit["recording"], f"{index}", *cells))
     titles = "PSNR, dB", "matched", "moving", "still", "active Gaussians", "kB", "s"
     return markdown(("recording", "frame", *titles), rows, left=1)
-
-
-def _cell(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 3)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from tyro.conf import Positional
 
-from benchmarks.reports.fits import DEFAULT, Clip
+from benchmarks.reports.fits import DEFAULT, Clip, new_loop
 from benchmarks.reports.method_tables import gains_table, plot_method
 from benchmarks.reports.plots import grouped
 from benchmarks.reports.study import Row, Scene, Study, Variant
@@ -171,7 +171,8 @@ def fitted(
     clip = Clip.read(capture)
     rows = list[Row]()
     for seed in range(options.seeds):
-        keyframe, _ = clip.loop(replace(options.base, seed=seed)).push(clip.images[0])
+        config = replace(options.base, seed=seed)
+        keyframe, _ = new_loop(capture, config).push(clip.images[0])
         if seed:
             best = [row for row in aggregate(rows, presets) if row["best"]]
             choice = [
@@ -199,17 +200,17 @@ def aggregate(rows: Sequence[Row], variants: Sequence[Variant]) -> list[dict[str
     for group in groups:
         names = [name for name in group[0] if name not in (*_SETTING, "fit_seed", "by_frame")]
         table = {name: np.array([row[name] for row in group], float) for name in names}
+        by_frame = [row["by_frame"] for row in group]
         series = {
-            n: np.mean([np.array(row["by_frame"][n], float) for row in group], axis=0)
-            for n in group[0]["by_frame"]
+            name: np.mean([np.array(row[name], float) for row in by_frame], axis=0)
+            for name in by_frame[0]
         }
+        spread = len(group) > 1
         row = {
             **_setting(group[0]),
             "runs": len(group),
             "mean": {name: float(values.mean()) for name, values in table.items()},
-            "std": {
-                name: float(v.std(ddof=1)) if len(v) > 1 else None for name, v in table.items()
-            },
+            "std": {name: float(v.std(ddof=1)) if spread else None for name, v in table.items()},
             "by_frame": {name: values.tolist() for name, values in series.items()},
             "best": any(group[0] is row for row in best.values()),
         }
@@ -234,22 +235,18 @@ def later_frames(clip: Clip, keyframe: Packet, config: StreamConfig) -> dict[str
         unknown.
     """
     fit = clip.continued(keyframe, config)
-    evaluations = fit.evaluation.frames[1:]
-    motion = [row.motion_3d for row in evaluations if row.motion_3d is not None]
+    frames = fit.evaluation.frames[1:]
+    motion = [row.motion_3d for row in frames if row.motion_3d is not None]
+    series = {name: [getattr(row.scores, name) for row in frames] for name in _MEANS}
+    series |= {f"motion_3d_{name}": [getattr(row, name) for row in motion] for name in _MOTION_3D}
+    series["num_bytes"] = [row.num_bytes for row in frames]
     return {
-        **{name: known_mean([getattr(row.scores, name) for row in evaluations]) for name in _MEANS},
-        "num_bytes": known_mean([row.num_bytes for row in evaluations]),
-        **{
-            f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion])
-            for name in _MOTION_3D
-        },
+        **{name: known_mean(values) for name, values in series.items()},
         "mtv": fit.evaluation.variation.render,
         "mtv_input": fit.evaluation.variation.input,
         "psnr_slope": fit.evaluation.psnr_slope,
         "seconds": float(np.median([report.seconds for report in fit.reports])),
-        "by_frame": {
-            name: [getattr(row.scores, name) for row in evaluations] for name in _BY_FRAME
-        },
+        "by_frame": {name: series[name] for name in _BY_FRAME},
     }
 
 
@@ -258,16 +255,14 @@ def flow_error(capture: Capture, config: StreamConfig) -> dict[str, float]:
     moves, px.
     """
     assert capture.truth is not None
+    motion = config.motion
     errors = []
     for previous, frame in pairwise(capture.frames()):
-        for view in choose_key_views(capture.cameras, config.motion.key_views):
+        for view in choose_key_views(capture.cameras, motion.key_views):
             camera = capture.cameras[view].name
-            pair = FramePair(
-                frame.images[view], previous.images[view], camera, frame.index, capture.masks[view]
-            )
-            flow = observe_key_views(
-                {view: pair}, config.motion.flow_method, flow=config.motion.flow
-            )[view]
+            images = frame.images[view], previous.images[view]
+            pair = FramePair(*images, camera, frame.index, capture.masks[view])
+            flow = observe_key_views({view: pair}, motion.flow_method, flow=motion.flow)[view]
             truth = load_truth(capture.truth, camera, frame.index)
             errors.append(np.linalg.norm(flow.motion - truth.motion, axis=-1)[truth.mask])
     return {"error": float(np.concatenate(errors).mean())}

@@ -19,11 +19,10 @@ import tyro
 
 from benchmarks.reports.fits import ClipOptions, new_loop
 from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.random_scenes import scores_of
 from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi import rasterize
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.truth import load_truth
-from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.evaluate.results import known_mean
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.fit_capture import push_frame
 from morgs_mi.studio.calibration.timing import estimate_time_offsets
@@ -86,6 +85,8 @@ def measure(
     aligned_capture = load_capture(
         recording.path, reading=replace(recording.reading, offset=offsets)
     )
+    # Its frames have other numbers than those of the truth, which `moving_psnr` converts.
+    aligned_capture = replace(aligned_capture, truth=recording.truth)
     first = int(
         aligned_capture.metadata()["cameras"][recording.names.index(reference)]["first_frame"]
     )
@@ -124,20 +125,16 @@ def moving_psnr(capture: Capture, frames: range, first: int, config: StreamConfi
     """
     test = capture.reference_view
     loop = new_loop(capture, config)
-    rows = []
-    camera = capture.cameras[test]
+    scores = []
     for k, frame in enumerate(capture.partial_frames(frames.start, frames.stop)):
         push_frame(loop, frame, capture.train_views)
         image = frame.images[test]
         assert loop.gaussians is not None
         assert image is not None
-        color = np.asarray(rasterize(loop.gaussians, camera, ("color",)).color)
-        target = image / 255.0
-        moving = load_truth(capture.path / "truth", camera.name, first + k).mask
-        if k and moving.any():
-            color = np.clip(color, 0, 1)
-            rows.append(psnr(color[moving], target[moving]))
-    return float(np.mean(rows))
+        if k:
+            row = scores_of(loop.gaussians, capture, test, first + k, image)
+            scores.append(row["psnr_moving"])
+    return known_mean(scores)
 
 
 if __name__ == "__main__":
