@@ -85,11 +85,6 @@ def test_stream_reader__round_trips_header_and_packets(tmp_path: Path) -> None:
             assert_equal(got, expected)
 
 
-@pytest.mark.parametrize("packet", PACKETS)
-def test_decode_packet__inverts_encoded(packet: Packet) -> None:
-    assert_equal(decode_packet(packet.encoded), packet)
-
-
 def test_packet__is_encoded_once_and_does_not_change() -> None:
     array = np.arange(3, dtype=np.uint32)
     packet = Packet(PacketKind.RESIDUAL, 1, {"a": array})
@@ -163,22 +158,13 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "should have 20 bytes, got 0"),
-        (sealed(b"")[:-1], "should have 20 bytes, got 19"),
         (sealed(b"\0" * 9)[:-1], "should have 29 bytes, got 28"),
         (sealed(b"", kind=7), r"1 \(keyframe\) or 2 \(residual\), got 7"),
-        (sealed(b"", kind=0), r"1 \(keyframe\) or 2 \(residual\), got 0"),
         (sealed(b"\xff\xff\xff\xff"), "table of arrays is broken"),
-        (with_table(b"no"), "table of arrays is broken"),
         (with_table(b"[" * 60_000), "table of arrays is broken .*recursion"),
-        (with_table(b"[1]"), "table of arrays is broken"),
         (with_table(b'{"a": 1}'), "table of arrays is broken"),
-        (with_table(b'[["a", "uint8"]]'), "table of arrays is broken"),
         (with_table(b'[[["a"], "uint8", [1]]]', bytes(1)), r"is declared as uint8 \[1\]"),
         (with_table(b'[["a", {"x": 1}, [1]]]', bytes(1)), "table of arrays is broken"),
-        (with_table(b'[["a", "f4,f4", [1]]]', bytes(8)), "table of arrays is broken"),
-        (with_table(b'[["a", "uint8", 1]]', bytes(1)), "`a` is declared as uint8 1"),
-        (with_table(b'[["a", "uint8", [true]]]', bytes(1)), r"`a` is declared as uint8 \[True\]"),
         (with_table(b'[["a", "uint8", [1.0]]]', bytes(1)), r"`a` is declared as uint8 \[1.0\]"),
         (
             with_table(b'[["a", "uint8", [1,1,1,1,1,1,1,1,1]]]', bytes(1)),
@@ -189,10 +175,6 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
             r"`a` is declared as uint8 \[1\]",
         ),
         (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, .* got NaN"),
-        (
-            with_table(b'[["a", "uint8", [' + b"1," * 33_000 + b"1]]]"),
-            "must have at most 65536 bytes, got 66021",
-        ),
         (with_table(b'[["a", "object", [1]]]', bytes(8)), "table of arrays is broken"),
         (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (
@@ -203,11 +185,6 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
             with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'),
             "integers of at most 64 bits",
         ),
-        (
-            with_table(b'[["a", "uint8", [10000000000000000000000]]]'),
-            "integers of at most 64 bits",
-        ),
-        (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -225,7 +202,6 @@ def test_decode_packet__refuses_inconsistent_packets(data: bytes, message: str) 
             Packet(PacketKind.RESIDUAL, 0, {"a": np.zeros(3)}),
             "arrays of float32, .* got .* of float64",
         ),
-        (Packet(PacketKind.RESIDUAL, 0, {"a": np.array([None])}), "got .* of object"),
     ],
 )
 def test_stream_writer__refuses_invalid_packets_and_writes_nothing_of_them(
@@ -243,12 +219,6 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
     path.write_bytes(b"ply\nformat ascii")
     with pytest.raises(
         ValueError, match=r"expected a stream that starts with b'MORGS-MI' and version 2, got b'ply"
-    ):
-        StreamReader(path)
-    path.write_bytes(struct.pack("<8sI", b"MORGS-MI", 9))
-    with pytest.raises(
-        ValueError,
-        match=r"and version 2, got b'MORGS-MI\\t.*; check the path, or read it with the release",
     ):
         StreamReader(path)
     preamble = struct.pack("<8sI", b"MORGS-MI", 2)
@@ -272,8 +242,8 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     "entries",
-    [[(0, 0, 700)], [(1, 0, 12)], [(1, 0, 2**63)], [(1, 0, 2**64 - 1)], [(2, 1, 900), (1, 0, 800)]],
-    ids=["kind", "inside the header", "large", "largest", "descending"],
+    [[(0, 0, 700)], [(1, 0, 12)], [(1, 0, 2**64 - 1)], [(2, 1, 900), (1, 0, 800)]],
+    ids=["kind", "inside the header", "large", "descending"],
 )
 def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausible(
     tmp_path: Path, entries: list[tuple[int, int, int]]
@@ -281,15 +251,14 @@ def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausib
     ends = write(tmp_path / "s")
     packed = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
     data = (tmp_path / "s").read_bytes()[: ends[-1]]
-    (tmp_path / "s").write_bytes(
-        data + sealed(packed + struct.pack("<Q8s", len(data), b"MORGSIDX"), 3)
-    )
+    index = sealed(packed + struct.pack("<Q8s", len(data), b"MORGSIDX"), 3)
+    (tmp_path / "s").write_bytes(data + index)
     reader = StreamReader(tmp_path / "s")
     assert [at for *_, at in reader.index()] == ends[:-1]
     assert len(list(reader.near(3))) == len(PACKETS)
 
 
-@pytest.mark.parametrize("length", [0, 5, 15, 16, 40])
+@pytest.mark.parametrize("length", [0, 15, 40])
 def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(
     tmp_path: Path, length: int
 ) -> None:

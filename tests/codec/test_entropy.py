@@ -36,7 +36,7 @@ def test_column_reader__inverts_the_writer_in_order() -> None:
         np.testing.assert_array_equal(reader.take(len(column)), column, name)
 
 
-@pytest.mark.parametrize("scale", [0.3, 1, 5, 40])
+@pytest.mark.parametrize("scale", [0.3, 40])
 def test_column_writer__is_close_to_the_entropy(scale: float) -> None:
     values = np.rint(np.random.default_rng(0).laplace(0, scale, 10_000)).astype(int)
     _, counts = np.unique(values, return_counts=True)

@@ -33,19 +33,13 @@ def with_entry(path: str, text: str) -> bytes:
     ("path", "text", "message"),
     [
         ("fps", "1e999", "numbers must be finite, .* got 1e999"),
-        ("fps", "NaN", "numbers must be finite, .* got NaN"),
         ("fps", "0", "`fps` must be a number from 1e-6 to 1e6, got 0"),
-        ("fps", "-25", "`fps` must be a number from 1e-6 to 1e6, got -25"),
-        ("fps", '"25"', "`fps` must be a number .* got '25'"),
         ("fps", "true", "`fps` must be a number .* got True"),
         ("fps", "1" + 400 * "0", "integers of at most 64 bits, got 1000"),
-        ("fps", "", "`fps` must be a number .* got None"),
         ("cameras", "[]", "`cameras` must be a list of at least one camera"),
-        ("cameras", "{}", "`cameras` must be a list of at least one camera, got {}"),
         ("cameras.1", "7", r"`cameras\[1\].name` must be a string, got None"),
         ("cameras.0.K.0.0", "-1", "must be finite with positive focal lengths"),
         ("metadata", "[]", r"`metadata` must be an object, got \[\]"),
-        ("metadata.seed", "1e999", "numbers must be finite"),
         ("metadata.seed", "[" * 31 + "]" * 31, "nested at most 32 levels deep"),
         ("metadata.seed", "[" * 100_000 + "]" * 100_000, "the JSON is broken .*recursion"),
         (
@@ -64,17 +58,12 @@ def test_header_fields__refuse_other_types_and_ranges(path: str, text: str, mess
 @pytest.mark.parametrize(
     ("path", "text", "message"),
     [
-        ("name", "3", ".name` must be a string, got 3"),
         ("name", '"\\u001b[2J"', "` must have a printable `name`"),
         ("name", '"\\ud800"', "` must have a printable `name`"),
-        ("name", "", ".name` must be a string, got None"),
         ("width", "32.5", ".width` must be an integer from 1 to 2^26, got 32.5"),
-        ("width", "0", ".width` must be an integer from 1 to 2^26, got 0"),
         ("height", "1000000", "` must have a printable `name`, at most 2^26 pixels"),
         ("near", "0", ".near` must be a number from 1e-12 to 1e12, got 0"),
-        ("near", "null", ".near` must be a number from 1e-12 to 1e12, got None"),
         ("K", "[[1,0,0],[0,1,0]]", ".K` must be three lists of three numbers"),
-        ("K.0.0", '"1"', ": `matrix` must be an array of real numbers"),
         ("K.0.0", "1e300", "` must have a printable `name`, at most 2^26 pixels, and `K` [3][3]"),
         (
             "viewmat",
@@ -96,7 +85,6 @@ def test_header_fields__refuse_other_types_and_ranges_of_a_camera(
     [
         (b"", "the JSON is broken"),
         (b"\xff\xfe", "the JSON is broken .'utf-8'"),
-        (b'{"a": 1', "the JSON is broken"),
         (b"[1]", "`cameras` must be a list of at least one camera"),
     ],
 )
@@ -115,21 +103,9 @@ def test_load_json__accepts_what_is_within_its_limits() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("cameras", "fps", "message"),
-    [
-        ([], 25, "a reader would refuse the header: `cameras` must be a list of at least one"),
-        (CAMERAS, 0, "a reader would refuse the header: `fps` must be a number"),
-        (
-            [Camera(CAMERAS[0].K, CAMERAS[0].viewmat, 2**14, 2**14)],
-            25,
-            r"a reader would refuse .* `cameras\[0\]` must have .* at most 2\^26 pixels",
-        ),
-    ],
-)
-def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(
-    tmp_path, cameras, fps, message: str
-) -> None:
+def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(tmp_path) -> None:
+    large = Camera(CAMERAS[0].K, CAMERAS[0].viewmat, 2**14, 2**14)
+    message = r"a reader would refuse .* `cameras\[0\]` must have .* at most 2\^26 pixels"
     with pytest.raises(ValueError, match=message):
-        StreamWriter(tmp_path / "s", cameras, fps)
+        StreamWriter(tmp_path / "s", [large], 25)
     assert not (tmp_path / "s").exists()

@@ -107,7 +107,7 @@ def single_at(x: float) -> Gaussians:
     return replace(single, means=[[x, 0, 0]])
 
 
-@pytest.mark.parametrize(("degree", "confidence"), [(0, False), (0, True), (2, False), (3, True)])
+@pytest.mark.parametrize(("degree", "confidence"), [(0, False), (3, True)])
 def test_decode__round_trips_every_degree_with_and_without_confidence(
     degree: int, confidence: bool
 ) -> None:
@@ -126,16 +126,6 @@ def test_residual_packet__removes_all_gaussians() -> None:
     assert (new_state.ids.tolist(), new_state.next_id) == ([5], 6)
 
 
-def test_decode__names_a_missing_packet() -> None:
-    packets, states = encoded_clip(4)
-    with pytest.raises(
-        ValueError, match="packet of frame 3: it does not continue the state after frame 1"
-    ):
-        decode(states[1], packets[3])
-    with pytest.raises(ValueError, match="packet of frame 1: it does not continue a state"):
-        decode(None, packets[1])
-
-
 def with_head(packet: Packet, *head: int) -> Packet:
     return with_array(packet, "head", np.array(head, np.uint32))
 
@@ -152,23 +142,10 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
             r"take at least \d+ words of code, got",
         ),
         (
-            lambda key, _: with_head(key, 60, 4, 1, 60),
-            r"at most .*'degree': 3, .* got \[60, 4, 1, 60\]",
-        ),
-        (
             lambda key, _: with_head(key, 60, 1, 5, 60),
             r"'optional': 1, .* got \[60, 1, 5, 60\]; read it with the release that wrote it",
         ),
         (lambda key, _: with_head(key, 60, 1, 1, 5), "its ids do not ascend"),
-        (
-            lambda key, _: with_head(key, 60, 1, 1, 2**30),
-            r"'next_id': 1073741823}, got \[60, 1, 1, 1073741824\]",
-        ),
-        (lambda key, _: with_head(key, 60), r"its head must have numbers .* got \[60\]"),
-        (
-            lambda _, residual: with_head(residual, 2**29, 8),
-            r"take at least \d+ words of code, got",
-        ),
         (
             lambda _, residual: with_head(residual, 2**31, 8),
             r"'births': \d+, .* got \[2147483648, 8\]",
@@ -177,16 +154,7 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
             lambda _, residual: with_head(residual, 0, 81),
             r"'quantizer_step': 80}, got \[0, 81\]",
         ),
-        (lambda key, _: Packet(key.kind, 0, {"head": key.arrays["head"]}), "expected the arrays"),
         (lambda key, _: with_array(key, "offset", key.arrays["code"]), "expected the arrays"),
-        (
-            lambda key, _: with_array(key, "head", np.full(4, np.inf, np.float32)),
-            r"expected the arrays .* got {'head': 'float32 \[n\]'",
-        ),
-        (
-            lambda key, _: with_array(key, "code", np.zeros(99, np.float32)),
-            r"expected the arrays .* 'code': 'float32 \[n\]'",
-        ),
         (
             lambda key, _: with_array(key, "code", key.arrays["code"][None]),
             r"expected the arrays .* 'code': 'uint32 \[1, \d+\]'",
@@ -194,10 +162,6 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
         (
             lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)),
             r"expected the arrays .* got {'parent': 'uint32 \[n\]'",
-        ),
-        (
-            lambda _, residual: with_array(residual, "offset", np.zeros(8, np.uint8)),
-            r"expected the arrays .* 'offset': 'uint8 \[n\]'",
         ),
         (
             lambda _, residual: with_array(residual, "offset", np.full(60, 2**32 - 1, "u4")),
@@ -227,23 +191,6 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
             decode(decode(states[0], damaged), packets[2])
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda s: keyframe_packet(replace(cloud(3), means=np.full((3, 3), np.nan)), 0),
-            "`means` must be finite",
-        ),
-        (lambda s: CodecConfig(quality=0), "`quality` must be above 0, got 0"),
-        (lambda s: CodecConfig(target_size=-1), "`target_size` must be at least 0, got -1"),
-    ],
-)
-def test_packets__refuse_bad_input(call, message: str) -> None:
-    state = decode(None, keyframe_packet(cloud(3), 0))
-    with pytest.raises(ValueError, match=message):
-        call(state)
-
-
 def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
     """A re-emitted keyframe repeats a set; a keyframe of the next frame starts another one with ids
     from 0.
@@ -258,3 +205,8 @@ def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
     ]
     ids = [(coded.frame, coded.lasting_ids.tolist()) for coded in coded_frames(packets)]
     assert ids == [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [3, 4])]
+
+
+def test_keyframe_packet__refuses_numbers_that_are_not_finite() -> None:
+    with pytest.raises(ValueError, match="`means` must be finite"):
+        keyframe_packet(replace(cloud(3), means=np.full((3, 3), np.nan)), 0)

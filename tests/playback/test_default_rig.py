@@ -35,7 +35,7 @@ def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
     assert across > 1
 
 
-@pytest.mark.parametrize("side", ["front", "right", "back-left"])
+@pytest.mark.parametrize("side", ["right", "back-left"])
 def test_default_rig__begins_where_the_scene_has_detail(side):
     toward = next(camera for camera in default_rig([splats(1)]) if camera.name == side).viewmat[
         2, :3
@@ -75,8 +75,3 @@ def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
 def test_default_rig__sees_a_single_gaussian():
     for camera in default_rig([splats(1)]):
         assert_close(camera.project(splats(1).numpy()["means"])[0], [[640, 360]], atol=1e-6)
-
-
-def test_default_rig__names_what_it_cannot_use():
-    with pytest.raises(ValueError, match="expected at least one Gaussian, got none"):
-        default_rig([splats(0)])

@@ -75,16 +75,6 @@ def test_write_images__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], expected)
 
 
-@pytest.mark.parametrize("stops", ["bright", 1e9, None])
-def test_stream_exposure__refuses_other_values(tmp_path, stops):
-    stream = open_stream(written(tmp_path / "s.morgs", {"transfer": {"display_exposure": stops}}))
-    with pytest.raises(
-        ValueError,
-        match=r"s\.morgs: packet 0: `transfer.display_exposure` of the header's metadata",
-    ):
-        stream_exposure(stream)
-
-
 @pytest.mark.slow
 def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(stream, tmp_path):
     ball = {"type": "sphere", "center": [0, 0, -1], "radius": 0.2}

@@ -47,7 +47,7 @@ end_header
 __all__ = ["run"]
 
 
-@pytest.fixture(params=range(4), ids=lambda degree: f"degree {degree}")
+@pytest.fixture(params=(0, 3), ids=lambda degree: f"degree {degree}")
 def file(tmp_path, request) -> Path:
     write_ply(tmp_path / "scene.ply", splats(degree=request.param))
     return tmp_path / "scene.ply"
@@ -110,7 +110,8 @@ def test_splat_file__of_a_model_has_the_cameras_of_its_training(tmp_path, run):
     for stream_camera, camera in zip(stream.cameras, rig(), strict=True):
         assert_close(stream_camera.viewmat, camera.viewmat, atol=1e-12)
         assert_close(stream_camera.K, camera.K, atol=1e-12)
-    assert run("render", path, tmp_path / "a.png", "--camera", "middle")[0] == 0
+    status, _, error = run("render", path, tmp_path / "a.png", "--camera", "middle")
+    assert (status, error) == (0, f"Cameras: {tmp_path}/cameras.json.\n")
     assert cv2.imread(str(tmp_path / "a.png")).shape == (48, 64, 3)
 
 
@@ -127,9 +128,7 @@ def test_splat_file__ignores_other_files_of_that_name(tmp_path):
         assert open_stream(tmp_path / "scene.ply").metadata["default_rig"] is True
 
 
-@pytest.mark.parametrize(
-    "change", [{"rotation": [[1, 0], [0, 1]]}, {"width": "wide"}, {"fx": -1}, {"position": None}]
-)
+@pytest.mark.parametrize("change", [{"rotation": [[1, 0], [0, 1]]}, {"position": None}])
 def test_splat_file__of_a_model_names_a_broken_camera(tmp_path, change):
     with pytest.raises(
         ValueError, match=r"cameras\.json: entry 0: expected a camera, got a broken one"
@@ -154,34 +153,9 @@ def test_render__draws_a_file_of_gaussians(tmp_path, run):
     assert read_exr(tmp_path / "a.exr")["depth.Y"].shape == (36, 64)
 
 
-@pytest.mark.slow
-def test_render__orbits_a_file_of_gaussians(tmp_path, run):
-    write_ply(tmp_path / "scene.ply", splats())
-    assert run("render", tmp_path / "scene.ply", "--width", 32)[:2] == (
-        0,
-        f"{tmp_path}/orbit.mp4: 150 images.\n",
-    )
-    path = tmp_path / "still.json"
-    path.write_text(
-        '{"keys": [{"time": 0, "camera": "left"}, {"time": 0.1, "camera": "back-left"}]}'
-    )
-    assert (
-        run("render", tmp_path / "scene.ply", tmp_path / "png", "--path", path, "--width", 32)[0]
-        == 0
-    )
-    assert [image.name for image in sorted((tmp_path / "png").iterdir())] == [
-        "0000.png",
-        "0001.png",
-        "0002.png",
-    ]
-
-
-@pytest.mark.parametrize(
-    "command", [("render",), ("view", "--no-browser"), ("export", "web")], ids=" ".join
-)
-def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, command):
+def test_render__names_what_is_no_file_of_gaussians(tmp_path, run):
     (tmp_path / "scene.ply").write_text(MESH)
-    status, _, error = run(*command, tmp_path / "scene.ply")
+    status, _, error = run("render", tmp_path / "scene.ply")
     assert (status, "Traceback" in error) == (1, False)
     assert f"{tmp_path}/scene.ply: " in error
     assert "got vertices without f_dc_0, f_dc_1, f_dc_2, opacity, scale_0" in error
@@ -196,8 +170,6 @@ def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, command):
             "a.png: expected one image for one file, got 150; name a folder",
         ),
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
-        (("--degrees", "0"), "--degrees must be a number in [1, 360], got 0"),
-        (("--width", "0"), "--width must be a number in [1, inf), got 0"),
         (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
     ],
 )
@@ -214,10 +186,10 @@ def test_splat_file__without_gaussians_is_named(tmp_path):
         open_stream(tmp_path / "scene.ply")
 
 
-def ring(center, count: int = 6, distance: float = 5) -> list[Camera]:
+def ring(center, count: int = 6) -> list[Camera]:
     """Return cameras on a circle that look at its centre."""
     angles = 2 * np.pi * np.arange(count) / count
-    origins = [np.add(center, (distance * np.sin(a), 0, -distance * np.cos(a))) for a in angles]
+    origins = [np.add(center, (5 * np.sin(a), 0, -5 * np.cos(a))) for a in angles]
     return look_at_cameras(
         origins, 45, 64, 48, [f"{i:05d}" for i in range(count)], target=center, up=(0, -1, 0)
     )
@@ -225,11 +197,9 @@ def ring(center, count: int = 6, distance: float = 5) -> list[Camera]:
 
 OTHER_SCENES = {
     "far away": ring((300, 0, 0)),
-    "a dot in one image": ring((300, 0, 0), 4),
     "looking away": [
         Camera.look_at((0, 0, 3), (x, 0, 9), (0, -1, 0), 45, 64, 48, f"{x}") for x in (-1, 0, 1)
     ],
-    "much larger": ring((0, 0, 0), 6, 1e5),
 }
 
 
@@ -265,18 +235,6 @@ def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
     assert open_stream(path).cameras_file == tmp_path / "cameras.json"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "command", [("render",), ("export", "video"), ("export", "web")], ids=" ".join
-)
-def test_commands__name_the_cameras_that_they_use(tmp_path, run, command):
-    path = write_model(tmp_path, rig())
-    status, _, error = run(
-        *command, path, *(["--width", 32] if command != ("export", "web") else [])
-    )
-    assert (status, error) == (0, f"Cameras: {tmp_path}/cameras.json.\n")
-
-
 def with_nan(path: Path, rows: int) -> Path:
     """Write 40 splats, the first of which have no finite centre."""
     means = splats().numpy()["means"]
@@ -285,26 +243,18 @@ def with_nan(path: Path, rows: int) -> Path:
     return path
 
 
-DRAWING = [("render",), ("export", "video"), ("export", "web")]
-WRITING = [("export", kind) for kind in ("ply", "gltf", "usd")]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", DRAWING, ids=" ".join)
-def test_commands__draw_without_invalid_gaussians(tmp_path, run, caplog, command):
+def test_render__draws_without_invalid_gaussians(tmp_path, run, caplog):
     path = with_nan(tmp_path / "a.ply", 2)
-    options = [] if command == ("export", "web") else ["--width", 32]
-    assert run(*command, path, *options)[0] == 0
+    assert run("render", path, tmp_path / "a.png", "--width", 32)[0] == 0
     assert "a.ply: 2 of 40 Gaussians are left out" in caplog.text
 
 
-@pytest.mark.parametrize("command", WRITING, ids=" ".join)
-def test_commands__write_no_other_number_of_gaussians_unasked(tmp_path, run, command):
+def test_export__writes_no_other_number_of_gaussians_unasked(tmp_path, run):
     path = with_nan(tmp_path / "a.ply", 1)
-    status, _, error = run(*command, path)
+    status, _, error = run("export", "ply", path)
     assert (status, [file.name for file in tmp_path.iterdir()]) == (1, ["a.ply"])
     assert "others in 1 of 40 Gaussians (centre of 0); leave them out with --drop-invalid" in error
-    assert run(*command, path, "--drop-invalid")[0] == 0
+    assert run("export", "ply", path, "--drop-invalid")[0] == 0
 
 
 def test_commands__refuse_a_file_that_is_broken_as_a_whole(tmp_path, run):

@@ -11,20 +11,13 @@ from tests.assertions import assert_close
 
 
 def test_motion_image__colours_are_as_documented():
-    motion = np.array([[[0, 0], [5, 0], [-5, 0], [50, 0], [np.nan, 0]]])
+    motion = np.array([[[0, 0], [2.5, 0], [5, 0], [-5, 0], [50, 0], [np.nan, 0]]])
     colours = visualise.motion_image(motion, 5.0)[0].tolist()
-    assert colours == [[255, 255, 255], [255, 0, 0], [0, 255, 255], [255, 0, 0], [128, 128, 128]]
+    assert colours[:2] == [[255, 255, 255], [255, 128, 128]]
+    assert colours[2:] == [[255, 0, 0], [0, 255, 255], [255, 0, 0], [128, 128, 128]]
     down, up = visualise.motion_image(np.array([[[0, 5], [0, -5]]]), 5.0)[0]
     assert down.argmax() == 1
     assert up.argmax() == 2
-
-
-def test_motion_image__saturation_increases_with_speed():
-    speeds = np.linspace(0, 10, 11)
-    green = visualise.motion_image(np.stack([speeds, 0 * speeds], -1)[None], 10)[0, :, 1].astype(
-        int
-    )
-    assert (np.diff(green) < 0).all()
 
 
 def test_motion_legend__agrees_with_the_image():
@@ -37,20 +30,6 @@ def test_motion_legend__agrees_with_the_image():
 def test_confidence_image__brightens_with_confidence():
     ramp = visualise.confidence_image(np.linspace(0, 1, 8)[None, :, None])
     assert (np.diff(ramp.sum(-1, dtype=int)[0]) > 0).all()
-
-
-def test_grey_image__is_the_mean_of_the_components():
-    values = np.linspace(0, 1, 8)[None, :, None]
-    np.testing.assert_array_equal(visualise.grey_image(values), visualise.to_uint8(values))
-    np.testing.assert_array_equal(visualise.grey_image(values[..., 0]), visualise.to_uint8(values))
-    assert (visualise.grey_image(np.tile([0, 0, 0.4, 0.4], (2, 3, 1))) == 51).all()
-
-
-def test_confidence_legend__agrees_with_the_image():
-    legend = visualise.confidence_legend(size=90)
-    for row, value in ((0, 1.0), (89, 0.0)):
-        assert (legend[row, :30] == visualise.confidence_image(np.array([[value]]))[0, 0]).all()
-    assert (legend[:, 89] == 255).all()
 
 
 def test_time_slice__time_increases_to_the_right():
@@ -73,15 +52,6 @@ def test_depth_image__near_is_red_far_is_blue_undefined_is_grey():
     assert np.unique(visualise.depth_image(np.ones((2, 2, 1)))[..., 0]).size == 1
 
 
-def test_contact_sheet__pads_images_to_common_sizes():
-    a = np.zeros((10, 20, 3), np.uint8)
-    b = np.ones((30, 5))
-    assert visualise.side_by_side([a, b]).shape == (30, 29, 3)
-    sheet = visualise.contact_sheet([[a, b], [a]])
-    assert sheet.shape == (44, 29, 3)
-    assert (sheet[35:44, 25:] == 255).all()
-
-
 def test_label__fits_any_size():
     for size in ((1, 1), (20, 30), (480, 640)):
         image = np.full((*size, 3), 0.5)
@@ -90,29 +60,20 @@ def test_label__fits_any_size():
         assert (labelled != visualise.to_uint8(image)).any()
 
 
-def test_write_png__round_trip(tmp_path):
+def test_write_png__is_lossless_and_removes_its_output_after_a_failure(tmp_path):
     image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), dtype=np.uint8)
-    path = tmp_path / "new" / "image.png"
-    visualise.write_png(path, image)
-    np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], image)
-    assert [p.name for p in path.parent.iterdir()] == ["image.png"]
-
-
-def test_write_png__removes_its_output_after_a_failure(tmp_path):
-    (tmp_path / "taken.png").mkdir()
+    visualise.write_png(tmp_path / "new" / "image.png", image)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new/image.png"))[..., ::-1], image)
+    (tmp_path / "new" / "taken.png").mkdir()
     with pytest.raises(OSError, match=r"cannot write .*taken\.png"):
-        visualise.write_png(tmp_path / "taken.png", np.zeros((2, 2)))
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match=r"cannot write .*a\.png"):
-        visualise.write_png(tmp_path / "file" / "a.png", np.zeros((2, 2)))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "taken.png"]
+        visualise.write_png(tmp_path / "new" / "taken.png", image)
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["image.png", "taken.png"]
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: visualise.to_uint8(np.zeros((2, 2, 4))), r"to_uint8\(\).*got \(2, 2, 4\)"),
-        (lambda: visualise.motion_image(np.zeros((2, 2)), 1), r"motion_image\(\).*\[H, W, 2\]"),
         (
             lambda: visualise.motion_image(np.zeros((2, 2, 2)), 0),
             r"motion_image\(\).*positive, got .* and 0",

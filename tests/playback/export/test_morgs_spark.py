@@ -36,16 +36,13 @@ FAILURE = (
 )
 
 
-def test_write_web_folder__contains_the_module(tmp_path):
+def test_write_web_folder__contains_the_module_which_imports_only_three_and_spark(tmp_path):
     write_stream(tmp_path / "stream.morgs")
     size = write_web_folder(open_stream(tmp_path), tmp_path / "web")
     assert size == sum(path.stat().st_size for path in (tmp_path / "web").iterdir())
     packaged = files("morgs_mi.playback.export") / "web_player" / MODULE
-    assert (tmp_path / "web" / MODULE).read_bytes() == packaged.read_bytes()
-
-
-def test_module__imports_only_three_and_spark_and_is_small():
-    code = (files("morgs_mi.playback.export") / "web_player" / MODULE).read_text(encoding="utf-8")
+    code = (tmp_path / "web" / MODULE).read_text(encoding="utf-8")
+    assert code == packaged.read_text(encoding="utf-8")
     assert set(re.findall(r'import[^;"]*from"([^"]*)"', code)) == {"three", "@sparkjsdev/spark"}
     assert len(code) < 30_000
 
@@ -88,15 +85,12 @@ def site(clip, tmp_path_factory):
     data = (folder / "stream.morgs").read_bytes()
     index = open_stream(folder).index()
     version = bytearray(data)
-    first = bytearray(data)
     late_bytes = bytearray(data)
     version[8] += 1
-    first[index[0][2] + 100] ^= 1
     late_bytes[index[2][2] + 100] ^= 1
     broken = {
         "page": b"something else",
         "version": version,
-        "first": first,
         "later": late_bytes,
         "cut": data[:-10],
     }
@@ -139,20 +133,15 @@ def scene(opened):
 
 
 def test_module__shows_the_images_of_the_renderer(scene, site, clip):
-    stream = open_stream(site[0])
-    for camera, frame in ((0, 0), (0, 3), (2, 2), (2, 1)):
-        expected = render(
-            clip[1][frame].gaussians, stream.cameras[camera], ("color",), render_config(stream)
-        )["color"]
+    """Also of a camera with a principal point off the centre."""
+    cameras = [*open_stream(site[0]).cameras]
+    cameras[1] = shift_principal_point(cameras[1], 30, -20)
+    scene.page.evaluate(f"splats.cameras[1].K = {cameras[1].K.tolist()}")
+    config = render_config(open_stream(site[0]))
+    for camera, frame in ((0, 0), (0, 3), (2, 1), (1, 1)):
+        gaussians = clip[1][frame].gaussians
+        expected = render(gaussians, cameras[camera], ("color",), config)["color"]
         assert psnr(scene.show(frame, camera) / 255, np.clip(expected, 0, 1)) > 40
-
-
-def test_module__places_cameras_with_an_off_centre_principal_point(scene, site, clip):
-    stream = open_stream(site[0])
-    camera = shift_principal_point(stream.cameras[1], 30, -20)
-    expected = render(clip[1][1].gaussians, camera, ("color",), render_config(stream))["color"]
-    scene.page.evaluate(f"splats.cameras[1].K = {camera.K.tolist()}")
-    assert psnr(scene.show(1, 1) / 255, np.clip(expected, 0, 1)) > 40
 
 
 def test_module__follows_the_mesh(scene):
@@ -191,9 +180,7 @@ def test_module__is_hidden_by_other_meshes(scene):
     assert psnr(behind[:, :100] / 255, image[:, :100] / 255) > 40
 
 
-@pytest.mark.parametrize(
-    ("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)]
-)
+@pytest.mark.parametrize(("seconds", "frame"), [(0.15, 1), (-0.1, 3), (1.25, 0)])
 def test_module__repeats(scene, seconds, frame):
     scene.page.evaluate(f"time = {seconds}; splats.update(time)")
     scene.wait(f"splats.position === {frame}")
@@ -208,20 +195,16 @@ def test_module__knows_the_size_of_a_frame(scene, clip):
     assert np.allclose(box, [means.min(axis=0), means.max(axis=0)], atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("page", "this is not a .morgs stream"),
-        ("version", "expected format version 2, found 3"),
-        ("first", "frame 0: the packet at byte"),
-        ("missing", "cannot be read: 404"),
-    ],
-)
-def test_module__refuses_what_it_cannot_play(browser, site, name, reason):
+def test_module__refuses_what_it_cannot_play(browser, site):
     with Scene(browser, f"{site[1]}/scene.html") as scene:
-        message = scene.page.evaluate(FAILURE.format(f"{name}.morgs"))
-    assert message.startswith(f"{name}.morgs")
-    assert reason in message
+        for name, reason in (
+            ("page", "this is not a .morgs stream"),
+            ("version", "expected format version 2, found 3"),
+            ("missing", "cannot be read: 404"),
+        ):
+            message = scene.page.evaluate(FAILURE.format(f"{name}.morgs"))
+            assert message.startswith(f"{name}.morgs")
+            assert reason in message
 
 
 @pytest.mark.parametrize(

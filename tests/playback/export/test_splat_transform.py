@@ -64,7 +64,7 @@ def assert_same(original: Gaussians, converted: Gaussians, atol: float) -> None:
     assert_close(columns[1], columns[0], atol=atol)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_write_compressed_ply__is_read_by_splat_transform(program, tmp_path, degree):
     write_compressed_ply(tmp_path / "a.compressed.ply", splats(700, degree))
     convert(program, tmp_path / "a.compressed.ply", tmp_path / "b.ply")
@@ -73,20 +73,13 @@ def test_write_compressed_ply__is_read_by_splat_transform(program, tmp_path, deg
     )
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-def test_read_compressed_ply__reads_a_file_of_splat_transform(program, tmp_path, degree):
-    write_ply(tmp_path / "a.ply", splats(20, degree))
+def test_read_compressed_ply__reads_a_file_of_splat_transform(program, tmp_path):
+    write_ply(tmp_path / "a.ply", splats(20, 2))
     convert(program, tmp_path / "a.ply", tmp_path / "b.compressed.ply")
     convert(program, tmp_path / "b.compressed.ply", tmp_path / "c.ply")
     compressed = read_compressed_ply(tmp_path / "b.compressed.ply")
     assert_same(read_ply(tmp_path / "c.ply"), compressed, atol=2e-6)
-    assert_same(splats(20, degree), compressed, atol=4.1 / 256)
-
-
-def test_write_ply__is_returned_by_splat_transform_unchanged(program, tmp_path):
-    write_ply(tmp_path / "a.ply", splats(100, 3))
-    convert(program, tmp_path / "a.ply", tmp_path / "b.ply")
-    assert_same(read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply"), atol=1e-6)
+    assert_same(splats(20, 2), compressed, atol=4.1 / 256)
 
 
 def test_read_splats__agrees_with_splat_transform_on_a_splat_file(program, tmp_path):

@@ -11,7 +11,6 @@ import pytest
 
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.fit_names import PROVISIONAL
-from morgs_mi.io.ply import write_ply
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.streams import open_stream
@@ -218,16 +217,6 @@ def test_page__names_a_damaged_packet(browser, tmp_path):
         page.page.keyboard.press("x")
         page.page.get_by_text("No exact image: ").wait_for()
         assert "packet 3 at byte" in page.text("#notes")
-
-
-def test_page__shows_a_file_of_gaussians(browser, tmp_path):
-    write_ply(tmp_path / "scene.ply", splats(degree=3))
-    with viewing(tmp_path / "scene.ply") as url, Viewed(browser, url, "exact") as page:
-        page.wait(f"player.settled && {RENDERING}")
-        assert page.exact_image().shape == (HEIGHT, WIDTH, 3)
-        shown = [page.page.locator(f"#{name}").is_visible() for name in ("slider", "wipe", "exact")]
-        assert shown == [False, False, True]
-        assert not page.errors
 
 
 def test_page__says_that_the_server_has_ended(browser, clip):
