@@ -86,19 +86,9 @@ CASES = {
         npy("(1000000000000, 17)"),
         "expected a NumPy array, got a broken file",
     ),
-    "npy of an overflow": (
-        read_array,
-        npy("(9223372036854775807, 17)"),
-        "expected a NumPy array, got a broken file",
-    ),
     "npy of negative size": (
         read_array,
         npy("(-2, -3)"),
-        "expected a NumPy array, got a broken file",
-    ),
-    "npy of a truth value": (
-        read_array,
-        npy("(True,)"),
         "expected a NumPy array, got a broken file",
     ),
     "npy of objects": (
@@ -106,36 +96,11 @@ CASES = {
         npy("(1,)", "'|O'", b"cos\nsystem\n."),
         "Object arrays cannot be loaded",
     ),
-    "npy of no bytes": (
-        read_array,
-        npy("(3,)", "'|V0'"),
-        "expected a NumPy array, got a broken file",
-    ),
     "npy of code": (read_array, npy("().__class__"), "expected a NumPy array, got a broken file"),
-    "npy of an open bracket": (
-        read_array,
-        npy_header("("),
-        "expected a NumPy array, got a broken file",
-    ),
-    "npy of bad indentation": (
-        read_array,
-        npy_header("\n  (\n )\n 1"),
-        "expected a NumPy array, got a broken file",
-    ),
-    "npy of no type": (
-        read_array,
-        npy("(6,)", "'<,4'"),
-        "expected a NumPy array, got a broken file",
-    ),
     "npz in place of npy": (
         read_array,
         npz(npy("(6,)")),
         "expected a NumPy array, got a broken file",
-    ),
-    "npz of many rows": (
-        archived,
-        npz(npy("(1000000000, 7)")),
-        "an array `data` in a NumPy archive, got a broken file",
     ),
     "npz bomb": (archived, npz(bytes(250_000_000)), "got a claim of 250000000 bytes of data.npy"),
     "npz of another name": (
@@ -155,11 +120,6 @@ CASES = {
         b'a = """' + b'\\"""' * 60_000,
         "expected TOML, got a broken file",
     ),
-    "TOML in Latin-1": (
-        read_toml,
-        "a = 'é'".encode("latin-1"),
-        "expected text in UTF-8, got a broken file",
-    ),
     "JSON in Latin-1": (
         read_json,
         '"é"'.encode("latin-1"),
@@ -170,16 +130,10 @@ CASES = {
         b"x = [" + b"1," * MAX_TOML + b"]",
         "expected at most 256000 bytes, got 512006",
     ),
-    "deep TOML": (read_toml, b"x = " + b"[" * 5000, "expected TOML, got a broken file"),
     "PLY of many vertices": (
         read_vertices,
         ply(BINARY + LARGE),
         "99999999999 vertex need 399999999996 bytes",
-    ),
-    "text PLY of many vertices": (
-        read_vertices,
-        ply("format ascii 1.0\n" + LARGE, b"1\n"),
-        "need .* bytes, 2 follow",
     ),
     "PLY of negative size": (
         read_vertices,
@@ -209,15 +163,9 @@ CASES = {
         ),
         "expected a compressed PLY",
     ),
-    "PLY of one line": (read_vertices, b"ply\n" + b"a" * 1_000_000, "expected a complete PLY file"),
     "PLY without an element": (
         read_vertices,
         ply(BINARY + "property float x\n"),
-        "expected a complete PLY file",
-    ),
-    "PLY of a word": (
-        read_vertices,
-        ply(BINARY + "element vertex many\n"),
         "expected a complete PLY file",
     ),
     "EXR of many pixels": (read_exr, large_exr, "got a claim of 40000x40000 pixels of 1 channels"),
@@ -241,7 +189,7 @@ def test_readers__refuse_a_hostile_file_in_one_sentence(
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [read_array, archived, array_names, read_json, read_toml])
+@pytest.mark.parametrize("read", [read_array, read_json])
 def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path):

@@ -22,23 +22,6 @@ def camera(request) -> Camera:
     return replace(camera, K=K)
 
 
-def test_project__agrees_with_the_mitsuba_sensor(camera):
-    point = np.array([0.2, -0.3, 0.1])
-    lamp = {
-        "type": "sphere",
-        "center": point.tolist(),
-        "radius": 0.05,
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
-    }
-    scene = mi.load_dict({"type": "scene", "lamp": lamp, "sensor": camera.sensor()})
-    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))[..., 0]
-    y, x = np.mgrid[:48, :64] + 0.5
-    centre = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
-    # A ball's image is an ellipse; its middle is not quite the image of the ball's centre; noise is
-    # 0.02 px.
-    assert_close(centre, camera.project(point)[0], atol=0.1)
-
-
 def test_project__inverts_the_rays_of_the_mitsuba_sensor(camera):
     y, x = np.mgrid[:48, :64].reshape(2, -1) + 0.5
     rays, _ = mi.load_dict(camera.sensor()).sample_ray(0, 0, mi.Point2f(x / 64, y / 48), 0)
@@ -67,9 +50,9 @@ def test_from_sensor__refuses_other_sensors(camera):
         Camera.from_sensor(camera.sensor())
 
 
-@pytest.mark.parametrize("ratio", [0.8, 0.99, 1.3])
-def test_sensor__refuses_two_focal_lengths(camera, ratio):
-    K = np.diag([1, ratio, 1]) @ camera.K
+def test_sensor__refuses_focal_lengths_that_differ_by_a_pixel_or_more(camera):
+    mi.load_dict(replace(camera, K=np.diag([1, 1 + 0.9 / 48, 1]) @ camera.K).sensor())
+    K = np.diag([1, 0.99, 1]) @ camera.K
     K[1, 2] = camera.K[1, 2]
     view = replace(camera, K=K, width=640, height=480)
     with pytest.raises(
@@ -85,23 +68,15 @@ def test_sensor__refuses_two_focal_lengths(camera, ratio):
     assert abs(square.K[0, 0] / square.K[1, 1] - 1) * square.height <= 0.5
 
 
-def test_sensor__accepts_focal_lengths_that_differ_by_less_than_a_pixel(camera):
-    mi.load_dict(replace(camera, K=np.diag([1, 1 + 0.9 / 48, 1]) @ camera.K).sensor())
-
-
-def test_unproject__inverts_project(camera):
+def test_rays_and_unproject__invert_project(camera):
     points = np.random.default_rng(0).uniform(-1, 1, (4, 5, 3))
     pixels, depths = camera.project(points)
     assert pixels.shape == (4, 5, 2)
     assert_close(camera.unproject(pixels, depths), points, atol=1e-12)
-
-
-def test_rays__start_at_the_camera_and_pass_through_their_pixels(camera):
-    pixels = np.random.default_rng(1).uniform((0, 0), (64, 48), (7, 2))
-    origin, directions = camera.rays(pixels)
+    origin, directions = camera.rays(pixels[0])
     np.testing.assert_allclose(origin, camera.position)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
-    assert_close(camera.project(origin + 2.5 * directions)[0], pixels, atol=1e-9)
+    assert_close(camera.project(origin + 2.5 * directions)[0], pixels[0], atol=1e-9)
 
 
 def test_projection_jacobian__agrees_with_central_differences(camera):
@@ -134,30 +109,21 @@ def test_camera__copies_its_matrices():
     ("change", "message"),
     [
         ({"near": np.nan}, r"`near` must be a number in \[1e-30, inf\), got nan"),
-        ({"near": 0}, "`near` must be a number"),
         ({"delay": 1.5}, r"`delay` must be a number in \[-1, 1\], got 1.5"),
-        ({"readout": np.nan}, r"`readout` must be a number in \[-1, 1\], got nan"),
         ({"width": 8.5}, "at least 1x1 in integers, got 8.5x16"),
-        ({"height": 0}, "at least 1x1 in integers, got 32x0"),
-        ({"K": "K"}, r"`K` must be an array of real numbers \[3, 3\], got 'K'"),
         ({"K": np.eye(2)}, r"`K` must be an array of real numbers \[3, 3\]"),
         ({"K": K + np.eye(3, k=1)}, "a camera without skew"),
         ({"K": -K}, "positive focal lengths"),
-        ({"viewmat": None}, r"`viewmat` must be an array of real numbers \[4, 4\], got None"),
-        ({"viewmat": VIEWMAT[:3]}, r"`viewmat` must be an array of real numbers \[4, 4\]"),
         ({"viewmat": VIEWMAT * np.nan}, r"Camera\(\), `viewmat`: the pose must be finite"),
         (
             {"viewmat": np.diag([1, 1, 1, 1e308])},
             "the pose must be finite, with numbers of at most 1e\\+12",
         ),
-        ({"viewmat": np.zeros((4, 4))}, "the axes must be a right-handed orthonormal frame, got"),
-        ({"viewmat": np.diag([2.0, 2, 2, 1]) @ VIEWMAT}, "undo any scaling or mirroring"),
         ({"viewmat": np.diag([-1.0, 1, 1, 1]) @ VIEWMAT}, "undo any scaling or mirroring"),
         (
             {"viewmat": np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]])},
             "transpose the matrix if",
         ),
-        ({"K": K * 1e13}, "`K` must be finite with positive focal lengths"),
         ({"viewmat": VIEWMAT * 1j}, "got complex128"),
     ],
 )
@@ -170,7 +136,6 @@ def test_camera__refuses_bad_input(change, message):
     ("change", "message"),
     [
         ({"target": (0, -3, 0)}, "`up` must not be parallel"),
-        ({"up": (0, 1, 0)}, "`up` must not be parallel"),
         ({"origin": (0, 0)}, r"`origin` must be an array of real numbers \[3\], got int64 \[2\]"),
         ({"fov_x": 180}, r"`fov_x` must be a number in \(0, 180\), got 180"),
     ],

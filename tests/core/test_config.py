@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import asdict, field
-from math import inf, nan
+from math import nan
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -12,19 +12,15 @@ import numpy as np
 import pytest
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
-from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.core.config import (
     apply_values,
     check_ranges,
     config_class,
     config_toml,
     read_config,
-    relocated,
-    types_of,
 )
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
-from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
 
 
@@ -87,26 +83,16 @@ class Config:
     offset: dict[str, float] = field(default_factory=dict)
 
 
-def round_trip(config: Any, path: Path) -> Any:
-    path.write_text(config_toml(config), encoding="utf-8")
-    return apply_values(type(config)(), read_config(path), str(path))
-
-
 @pytest.mark.parametrize(
     "config",
     [
-        StreamConfig(),
         *(apply_preset(StreamConfig(), name) for name in PRESETS),
         StreamConfig(
             fit=FitConfig(
                 density=DensityConfig(rounds=0, births=1 / 3), rates=LearningRates(means=1e-300)
             ),
-            motion=MotionConfig(mask_method="none", cohesion_weight=1e22),
             render=RenderConfig(block_width=4, block_height=None),
-            codec=CodecConfig(quality=0.1 + 0.2),
-            seed=3,
         ),
-        Leaf(),
         Leaf(
             number=3e38,
             name='"quoted" \\ \n\t\x00\x1b\x7f é 漢 🙂',
@@ -114,13 +100,13 @@ def round_trip(config: Any, path: Path) -> Any:
             limit=None,
             mode="exact",
         ),
-        Leaf(pair=(0.25, -0.0), count=2**63),
-        Root(),
-        Root(Branch(Leaf(count=7, name="none"), weight=-1.0), seed=4),
+        Root(Branch(Leaf(pair=(0.25, -0.0), count=2**63, name="none"), weight=-1.0), seed=4),
     ],
 )
 def test_config_toml__is_read_back_as_the_same_config(config: Any, tmp_path: Path) -> None:
-    assert round_trip(config, tmp_path / "a.toml") == config
+    (tmp_path / "a.toml").write_text(config_toml(config), encoding="utf-8")
+    values = read_config(tmp_path / "a.toml")
+    assert apply_values(type(config)(), values, "a.toml") == config
 
 
 def test_config_toml__restores_a_config_over_other_values(tmp_path: Path) -> None:
@@ -162,45 +148,17 @@ def test_apply_values__replaces_only_what_is_named() -> None:
 @pytest.mark.parametrize(
     ("config", "text", "message"),
     [
-        (
-            StreamConfig(),
-            "epochs = 2",
-            "`epochs` is unknown, expected `fit` or `motion` or `render` or `codec` or `seed`",
-        ),
         (StreamConfig(), "[fit]\nepoch = 2", "`fit.epoch` is unknown, expected `fit.epochs`."),
-        (
-            StreamConfig(),
-            "[fit]\nepochs = 'many'",
-            "`fit.epochs` must be a whole number below 2^64, at least 1, got 'many'.",
-        ),
-        (
-            StreamConfig(),
-            "[fit]\nepochs = 99999999999999999999",
-            "`fit.epochs` must be a whole number below 2^64, at least 1, got 99999999999999999999.",
-        ),
-        (
-            StreamConfig(),
-            "[fit]\nskip_static = 1",
-            "`fit.skip_static` must be true or false, got 1.",
-        ),
-        (
-            StreamConfig(),
-            "[motion]\nflow_method = 1",
-            "`motion.flow_method` must be a string, got 1.",
-        ),
         (
             StreamConfig(),
             "[motion]\nflow_method = 1979-05-27",
             "`motion.flow_method` must be a string, got ",
         ),
-        (StreamConfig(), "fit = 1", "`fit` must be a table, got 1."),
         (
             StreamConfig(),
             "[[fit]]\nepochs = 1",
             "`fit` must be a table, got ({'epochs': 1},).",
         ),
-        (StreamConfig(), "[fit]\nepochs = 0", "`fit.epochs` must be at least 1, got 0."),
-        (Leaf(), "sizes = 1", "`sizes` must be a list, got 1."),
         (
             Leaf(),
             "sizes = [1, 'a']",
@@ -237,11 +195,6 @@ def test_apply_values__names_file_key_expected_and_given(
     [
         (None, FileNotFoundError, "expected a TOML file with settings, found none; write one with"),
         (b"fit = ", ValueError, r"expected TOML, got a broken file \(Invalid value"),
-        (
-            b"a = 1\na = 2",
-            ValueError,
-            r"expected TOML, got a broken file \(Cannot overwrite a value",
-        ),
         (b"\xff", ValueError, r"expected text in UTF-8, got a broken file \('utf-8' codec"),
     ],
 )
@@ -253,13 +206,6 @@ def test_read_config__names_a_file_that_cannot_be_read(
         path.write_bytes(content)
     with pytest.raises(error, match=f"a.toml: {message}"):
         read_config(path)
-
-
-def test_relocated__changes_only_errors_that_name_a_field() -> None:
-    error = ValueError("other(): `b` must be 1.")
-    assert relocated(error, "f.toml", "x.", ["a"]) is error
-    text = str(relocated(ValueError("A.b(): `a` must be less than `b`."), "f.toml", "x.", ["a"]))
-    assert text == "f.toml: `x.a` must be less than `b`."
 
 
 @pytest.mark.parametrize(
@@ -284,25 +230,14 @@ def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("count", 0, "at least 1, got 0."),
         ("count", 2.5, "a whole number below 2^64, at least 1, got 2.5."),
         ("count", True, "a whole number below 2^64, at least 1, got True."),
-        ("count", None, "a whole number below 2^64, at least 1, got None."),
         ("width", 6, "at least 4 and a multiple of 4, got 6."),
-        (
-            "width",
-            8.0,
-            "a whole number below 2^64, at least 4 and a multiple of 4, got 8.0.",
-        ),
         ("share", 0, "above 0 and at most 1, got 0."),
-        ("share", 1.5, "above 0 and at most 1, got 1.5."),
         ("share", nan, "a finite number, above 0 and at most 1, got nan."),
-        ("share", "1", "a finite number, above 0 and at most 1, got '1'."),
         ("opacity", 1, "at least 0 and below 1, got 1."),
         ("offset", {"a": "1"}, "a table, each value a finite number, got {'a': '1'}."),
-        ("number", inf, "a finite number, got inf."),
         ("number", 10**400, "a finite number, got 1000000"),
-        ("seed", 2**64, "a whole number below 2^64, got 18446744073709551616."),
         ("on", 1, "true or false, got 1."),
         ("name", None, "a string, got None."),
         ("mode", "yes", "one of off, auto, on, got 'yes'."),
@@ -327,7 +262,3 @@ def test_check_ranges__begins_with_the_given_place():
     object.__setattr__(config, "count", 0)
     with pytest.raises(ValueError, match=r"^fit_live\(\): `count` must be at least 1, got 0\."):
         check_ranges(config, "fit_live()")
-
-
-def test_types_of__are_those_of_the_fields():
-    assert list(types_of(Config))[:2] == ["count", "width"]

@@ -69,21 +69,14 @@ Fields:
     assert Plant.__doc__ == inspect.getdoc(Plant) == Plant().__doc__ == expected
 
 
-def test_page__is_a_path_in_the_checkout() -> None:
-    assert page("flow") == "docs/flow.md"
-
-
-def test_page__is_an_address_without_a_checkout(
+def test_page__is_a_path_in_the_checkout_and_else_an_address(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert page("flow") == "docs/flow.md"
     monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
     assert (
-        page("experiments/field")
-        == "https://morgs-mi.readthedocs.io/en/latest/experiments/field.html"
-    )
-    assert (
-        with_pages("a, see docs/flow.md.")
-        == "a, see https://morgs-mi.readthedocs.io/en/latest/flow.html."
+        with_pages("a, see docs/experiments/field.md.")
+        == "a, see https://morgs-mi.readthedocs.io/en/latest/experiments/field.html."
     )
     assert with_pages("mydocs/flow.md, docs/flow.toml") == "mydocs/flow.md, docs/flow.toml"
 

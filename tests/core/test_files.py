@@ -47,10 +47,13 @@ def test_atomic_path__appears_at_the_end_and_replaces_the_old(
     assert tree(tmp_path) == ({"x": b"new"} if kind == "file" else {"x": None, "x/a": b"new"})
 
 
-@pytest.mark.parametrize("kind", ["file", "folder"])
-@pytest.mark.parametrize("old", [False, True])
 @pytest.mark.parametrize(
-    "error", [ValueError("bad"), KeyboardInterrupt("stop"), OSError(28, "No space left")]
+    ("kind", "old", "error"),
+    [
+        ("file", True, KeyboardInterrupt("stop")),
+        ("folder", True, ValueError("bad")),
+        ("folder", False, OSError(28, "No space left")),
+    ],
 )
 def test_atomic_path__is_unchanged_after_an_error_in_the_body(
     tmp_path: Path, kind: str, old: bool, error
@@ -78,15 +81,11 @@ def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path: Path) -> None:
     assert tree(tmp_path) == old_tree
 
 
-@pytest.mark.parametrize("case", ["a file", "read-only", "a folder", "missing"])
+@pytest.mark.parametrize("case", ["a file", "a folder", "missing"])
 def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case: str) -> None:
     folder = tmp_path / "folder"
     if case == "a file":
         folder.touch()
-    elif case == "read-only":
-        folder.mkdir(mode=0o500)
-        if os.access(folder, os.W_OK):
-            pytest.skip("root may write everywhere")
     elif case == "a folder":
         (folder / "x").mkdir(parents=True)
     old_tree = tree(tmp_path)
@@ -159,16 +158,6 @@ def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(
     with pytest.raises(OSError, match=r"y, .*not empty"), atomic_folder(tmp_path / "y", "test()"):
         write(tmp_path / "y", "folder", "theirs")
     assert tree(tmp_path) == {"x": None, "x/a": b"old", "y": None, "y/a": b"theirs"}
-
-
-def test_atomic_folder__reports_a_failed_file_in_one_sentence(tmp_path: Path) -> None:
-    with (
-        files_end_at(10),
-        pytest.raises(OSError, match=r"^test\(\): .*/new/x, [^(]*: File too large; [^:]*$"),
-        atomic_folder(tmp_path / "new" / "x", "test()") as folder,
-    ):
-        write_json(folder / "a.json", {"a": "b" * 1000})
-    assert tree(tmp_path) == {"new": None}
 
 
 def test_write_json__writes_null_for_infinity_and_nan(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ def cloud(degree: int) -> Gaussians:
     return to_gaussians(make_scene(degree, n=5))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_join_sh__inverts_split_sh_with_gradient(degree):
     sh = cloud(degree).sh_coeffs
     dr.enable_grad(sh)
@@ -42,11 +42,8 @@ def test_parameters__are_those_of_the_table_and_with_parameters_inverts_them(deg
     [
         ("quats", np.zeros((4, 4)), r"`quats` must be \[5, 4\], got \[4, 4\]"),
         ("sh_coeffs", np.zeros((5, 2, 3)), r"must be .* or \[5, 16, 3\], got \[5, 2, 3\]"),
-        ("means", np.zeros(3), r"`means` must be \[\d, 3\]"),
         ("means", 0.0, r"`means` must be \[\d, 3\]"),
-        ("means", None, "`means` must be an array of real numbers"),
         ("means", [[1, 2], [3]], "`means` must be an array of real numbers"),
-        ("means", np.zeros((5, 3), complex), "`means` must be an array of real numbers"),
         ("logit_opacities", mi.Float(np.zeros(5)), "must be a NumPy array or a drjit"),
     ],
 )
@@ -92,9 +89,7 @@ def test_numpy__returns_copies():
     assert not (np.asarray(gaussians.means) == 7).any()
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("scales", -1), ("opacities", -0.1), ("opacities", 1.5)]
-)
+@pytest.mark.parametrize(("name", "value"), [("scales", -1), ("opacities", 1.5)])
 def test_from_activated__refuses_values_that_are_not_activated(name, value):
     values = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh_coeffs": (1, 3)}
     values = {name: np.full((2, *shape), 0.5) for name, shape in values.items()}

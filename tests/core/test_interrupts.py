@@ -155,8 +155,9 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
-@pytest.mark.parametrize("module", ["numpy", "drjit", "tyro"])
+@pytest.mark.parametrize(
+    ("module", "number"), [("numpy", "SIGINT"), ("drjit", "SIGTERM"), ("tyro", "SIGHUP")]
+)
 def test_begin_command__ends_quietly_while_libraries_are_imported(module: str, number: str) -> None:
     script = STARTING.format(module=module, number=number)
     result = subprocess.run(

@@ -10,13 +10,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, cli, rasterize
+from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.core.memory import check_memory, from_numpy, owned_copy, process_memory
 from tests.quick import quick
 from tests.scenes.changing_splats import rig, splats
 
 
-@pytest.mark.parametrize("kind", ["Float", "Float64", "Int32", "UInt32", "Bool", "TensorXf"])
+@pytest.mark.parametrize("kind", ["Float", "UInt32", "TensorXf"])
 def test_from_numpy__converts_to_the_type_in_aligned_memory(kind):
     kind = getattr(mi, kind)
     values = np.arange(12.0).reshape(3, 4)
@@ -115,22 +115,3 @@ def test_StreamLoop__refuses_more_gaussians_than_pixels_determine():
     config = StreamConfig(fit=FitConfig(num_gaussians=2000))
     with pytest.raises(ValueError, match="`num_gaussians` must be at most 1024, 16 for each"):
         StreamLoop([wide(8)], (), (), config)
-
-
-def test_synthesize__refuses_images_that_do_not_fit_in_memory(tmp_path, capsys):
-    assert (
-        cli.main(
-            [
-                "synth",
-                "spheres",
-                str(tmp_path / "a"),
-                "--width",
-                "1000000000",
-                "--height",
-                "1000000",
-            ]
-        )
-        == 1
-    )
-    assert "got images of 1000000000x1000000 pixels" in capsys.readouterr().err
-    assert not (tmp_path / "a").exists()

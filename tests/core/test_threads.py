@@ -7,10 +7,7 @@ import pytest
 from morgs_mi.core.threads import map_in_threads
 
 
-def test_map_in_threads__keeps_the_order():
+def test_map_in_threads__keeps_the_order_and_raises_what_the_function_raises():
     assert map_in_threads(lambda x: x * x, range(50)) == [x * x for x in range(50)]
-
-
-def test_map_in_threads__raises_what_the_function_raises():
     with pytest.raises(ZeroDivisionError):
         map_in_threads(lambda x: 1 // x, [1, 0])
