@@ -25,7 +25,7 @@ from morgs_mi.playback.visualise import write_png
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
 from tests.quick import SHORT_FITS
-from tests.scenes.captures import transforms
+from tests.scenes import captures as layouts
 from tests.scenes.changing_splats import splats
 
 PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")
@@ -69,24 +69,8 @@ def multipleview(recording: Capture) -> None:
     write_colmap("multipleview/SCENE/sparse_", other, recording.points)
 
 
-def dynamic3dgs(recording: Capture) -> None:
-    write_images(recording, "dynamic3dgs/SCENE/ims/{camera}/{frame:06d}.png")
-
-    def meta(cameras: list[Camera]) -> str:
-        names = [[f"{camera.name}/{t:06d}.png" for camera in cameras] for t in range(FRAMES)]
-        entries = {
-            "k": [[camera.K.tolist() for camera in cameras]] * FRAMES,
-            "w2c": [[np.asarray(camera.viewmat).tolist() for camera in cameras]] * FRAMES,
-            "cam_id": [[camera.name for camera in cameras]] * FRAMES,
-        }
-        return json.dumps({"w": cameras[0].width, "h": cameras[0].height, "fn": names, **entries})
-
-    Path("dynamic3dgs/SCENE/train_meta.json").write_text(meta(list(recording.cameras[1:])))
-    Path("dynamic3dgs/SCENE/test_meta.json").write_text(meta(list(recording.cameras[:1])))
-    points = np.concatenate(
-        [recording.points, recording.point_colors, np.ones((len(recording.points), 1))], axis=1
-    )
-    np.savez("dynamic3dgs/SCENE/init_pt_cld.npz", data=points)
+def dynamic3dgs(_: Capture) -> None:
+    layouts.dynamic3dgs(Path("dynamic3dgs/SCENE"))
 
 
 def stream3dgs(recording: Capture) -> None:
@@ -104,7 +88,7 @@ def nerfstudio(recording: Capture) -> None:
         for folder in ("images", "images_2"):
             write_png(Path(f"nerfstudio/SCENE/{folder}/frame_{i:05d}.png"), image)
         cameras.append(replace(camera, name=f"images/frame_{i:05d}.png"))
-    transforms(Path("nerfstudio/SCENE"), cameras)
+    layouts.transforms(Path("nerfstudio/SCENE"), cameras)
 
 
 def vggt(recording: Capture) -> None:
@@ -140,9 +124,8 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(
         if rest[0] == "fit":
             frames[rest[2]] = len(json.loads(Path(rest[2], "report.json").read_text())["frames"])
     assert [frames.pop(f"out/{name}") for name in ("nerfstudio", "vggt")] == [1, 1]
-    assert frames == {
-        f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "dynamic3dgs", "3dgstream")
-    }
+    assert frames.pop("out/dynamic3dgs") == layouts.COUNT
+    assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "3dgstream")}
     assert outputs["info"].startswith("Views between the cameras will be ")
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import cv2
 import pytest
 
 from morgs_mi.core.fit_names import PROVISIONAL
-from morgs_mi.playback.visualise import write_png
 from tests.cli.commands import assert_refused
 from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording
@@ -21,23 +19,6 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
             run("eval", stream, "--json", tmp_path / name),
             f"{name}: expected a new file, got one that the fit has written",
         )
-
-
-@pytest.mark.slow
-def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run) -> None:
-    clip = write_recording(tmp_path / "clip", 2)
-    out = tmp_path / "out"
-    assert run("fit", clip, out, *OPTIONS)[0] == 0
-    other = shutil.copytree(clip, tmp_path / "other")
-    for image in other.glob("cam*/*.png"):
-        write_png(image, 255 - cv2.imread(str(image))[..., ::-1])
-    assert_refused(
-        run("eval", out, "--capture", other, "--figures", tmp_path / "figures"),
-        f"{other}: expected the recording that {out}/stream.morgs was fitted to",
-        "--any-recor",
-    )
-    assert not (tmp_path / "figures").exists()
-    assert run("eval", out, "--capture", other, "--any-recording")[0] == 0
 
 
 @pytest.mark.slow
@@ -55,21 +36,13 @@ def test_eval__says_that_a_first_frame_is_provisional(
     assert [sentence in message for message in caplog.messages] == [True, True]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[]", "expected a fit's report, got a broken one"),
-        (
-            f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}',
-            "expected a fit's report, got a broken one",
-        ),
-    ],
-)
 def test_eval__reports_a_hostile_report_in_one_sentence(
-    fitted_clip: Path, tmp_path: Path, run, text: str, message: str
+    fitted_clip: Path, tmp_path: Path, run
 ) -> None:
     shutil.copy(fitted_clip / "stream.morgs", tmp_path)
-    (tmp_path / "report.json").write_text(text)
+    report = f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}'
+    (tmp_path / "report.json").write_text(report)
     assert_refused(
-        run("eval", tmp_path, "--capture", fitted_clip / "capture"), f"report.json: {message}"
+        run("eval", tmp_path, "--capture", fitted_clip / "capture"),
+        "report.json: expected a fit's report, got a broken one",
     )

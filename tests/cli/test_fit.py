@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import astuple, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,16 +54,6 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
     assert [frame["views"]["cam1"]["psnr"] is None for frame in frames] == [False, True, True]
     assert all(frame["psnr"] > 0 for frame in frames)
-
-
-@pytest.mark.slow
-def test_fit__reports_what_to_expect_of_views_between_the_cameras(
-    capture: Path, tmp_path: Path, run
-) -> None:
-    code, output, _ = run("fit", capture, tmp_path / "out", *OPTIONS, "--test-view", "none")
-    (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
-    assert code == 0
-    assert first["validation"]["sentence"] in " ".join(output.split())
 
 
 @pytest.mark.slow
@@ -132,38 +123,23 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        (["--frames", "0"], ("--frames must be at least 1, got 0",)),
         (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
         (
             ["--test-view", "3"],
             ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3"),
         ),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
-        (["--seed", "-1"], ("--seed must be at least 0, got -1",)),
-        (["--chunks", "0"], ("--chunks must be at least 1, got 0",)),
-        (["--sh-degree", "4"], ("--sh-degree must be at least 0 and at most 3, got 4",)),
         (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
         (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
         (["--flow", "files:nowhere"], ("nowhere",)),
-        (["--masks", "some"], ("--masks must be one of none,", "got 'some'")),
         (
             ["--config", "nowhere.toml"],
             ("nowhere.toml: expected a TOML file with settings, found none",),
-        ),
-        (["--config", "[fit"], ("bad.toml: expected TOML, got a broken file",)),
-        (
-            ["--config", "[fit]\nepoch = 1"],
-            ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",),
         ),
         (
             ["--config", "[motion]\nflow_method = 'no'"],
             ("bad.toml: `motion.flow_method` must be one of dis,",),
         ),
-        (
-            ["--config", "[motion]\nmask_method = 'no'"],
-            ("bad.toml: `motion.mask_method` must be one of none,",),
-        ),
-        (["--config", "[motion]\nmodel = 'no'"], ("bad.toml: `motion.model` must be one of none",)),
         (
             ["--variant", "cuda_ad_rgb"],
             ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb"),
@@ -183,35 +159,19 @@ def test_fit__rejects_bad_input_in_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("args", "part"),
-    [
-        (["--epochs", "many"], "many"),
-        (["--nonsense"], "--nonsense"),
-        (["--fit.epochs", "1"], "--fit.epochs"),
-    ],
-)
-def test_fit__rejects_arguments_that_cannot_be_parsed(
-    capture: Path, tmp_path: Path, capsys, args, part
-) -> None:
+def test_fit__rejects_arguments_that_cannot_be_parsed(tmp_path: Path, capsys) -> None:
     with pytest.raises(SystemExit) as stop:
-        cli.main(["fit", str(capture), str(tmp_path / "out"), *args])
+        cli.main(["fit", str(tmp_path), str(tmp_path / "out"), "--epochs", "many"])
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
-    assert part in " ".join(error.replace("│", " ").split())
+    assert "many" in error
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("view", "test_views"),
-    [
-        (("cam1",), (1,)),
-        (("2",), (2,)),
-        (("cam2", "0"), (0, 2)),
-        (("none",), ()),
-        (("auto",), ()),
-    ],
+    [(("cam1",), (1,)), (("cam2", "0"), (0, 2)), (("auto",), ())],
 )
 def test_fit__takes_the_held_out_camera_by_index_or_name(
     capture: Path,
@@ -259,17 +219,25 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(
     )
 
 
+def clean_up(*_: object) -> None:
+    """Do what a library may make of an interruption."""
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        raise RuntimeError("drjit: an exception in a callback") from None
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("interrupted", [partial(signal.raise_signal, signal.SIGTERM), clean_up])
 def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     capture: Path,
     tmp_path: Path,
     run,
     monkeypatch: pytest.MonkeyPatch,
-    number: signal.Signals,
+    interrupted: Callable[[], None],
     heeds_interrupts: None,
 ) -> None:
-    before_frame_2(monkeypatch, lambda: signal.raise_signal(number))
+    before_frame_2(monkeypatch, interrupted)
     args = ["fit", str(capture), str(tmp_path / "my out"), *OPTIONS]
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
@@ -282,27 +250,6 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     status, _, error = run("eval", tmp_path / "my out", "--json", tmp_path / "eval.json")
     assert (status, "the fit was not finished" in error) == (0, True)
     assert not json.loads((tmp_path / "eval.json").read_text())["complete"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("raised_in", ["a callback", "the clean-up"])
-def test_fit__is_interrupted_whatever_a_library_makes_of_ctrl_c(
-    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, raised_in: str
-) -> None:
-    def library(*_: object) -> None:
-        try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt as error:
-            raise RuntimeError("drjit: an exception in a callback") from (
-                error if raised_in == "a callback" else None
-            )
-
-    before_frame_2(monkeypatch, library)
-    status, _, error = run("fit", capture, tmp_path / "out", *OPTIONS)
-    assert status == 130
-    assert error.splitlines()[-1].startswith(
-        f"Interrupted. {tmp_path / 'out'}/stream.morgs holds frames 0 to 1 of 3; "
-    )
 
 
 def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
@@ -362,11 +309,13 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> None:
+def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_cameras(
+    tmp_path: Path, run
+) -> None:
     clip = write_recording(tmp_path / "clip", 2)
     for image in clip.glob("cam*/0000.png"):
         write_png(image, np.zeros((24, 32, 3), np.uint8))
-    status, output, _ = run("fit", clip, tmp_path / "out", *OPTIONS)
+    status, output, _ = run("fit", clip, tmp_path / "out", *OPTIONS, "--test-view", "none")
     (first, second) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert (status, second["status"]) == (0, "ok")
     assert "the image is black; cut such frames off" in first["status"]
@@ -374,19 +323,7 @@ def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> Non
         f"1 of 2 frames have a problem (status in report.json), frame 0: {first['status']}."
         in output
     )
-
-
-@pytest.mark.slow
-def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:
-    out = tmp_path / "out"
-    fit = ("fit", capture, out, *OPTIONS)
-    assert run(*fit)[0] == 0
-    whole = (out / "stream.morgs").read_bytes()
-    (out / "stream.morgs").write_bytes(whole[: len(whole) * 3 // 4])
-    status, output, _ = run(*fit, "--resume")
-    assert status == 0
-    assert f"stream.morgs: {FRAMES} frames" in output
-    assert (out / "stream.morgs").read_bytes() == whole
+    assert first["validation"]["sentence"] in " ".join(output.split())
 
 
 @pytest.mark.slow

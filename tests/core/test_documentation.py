@@ -6,13 +6,12 @@ import inspect
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from morgs_mi.core import documentation
 from morgs_mi.core.config import config_toml
-from morgs_mi.core.documentation import documented, field_docs, page, with_pages
+from morgs_mi.core.documentation import documented, page, with_pages
 from morgs_mi.loop.stream_config import StreamConfig
 
 ROOT = Path(__file__).parents[2]
@@ -41,18 +40,6 @@ class Plant:
     stem: Stem = field(default_factory=Stem)
     roots: int = 3
     """Number of roots."""
-
-
-def test_field_docs__returns_docstrings_by_field() -> None:
-    docs = {
-        "number": "Length\nin px.",
-        "name": "Name, see docs/flow.md.",
-        "roots": "Number of roots.",
-    }
-    assert field_docs(Plant) == docs
-    without_source: dict[str, Any] = {"__name__": "__main__"}
-    exec("from dataclasses import dataclass\n@dataclass\nclass A:\n    a: int = 1", without_source)
-    assert field_docs(without_source["A"]) == {}
 
 
 def test_documented__lists_fields_with_defaults() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -99,11 +101,7 @@ def test_from_activated__refuses_values_that_are_not_activated(name, value):
 
 
 def test_repr__has_number_degree_and_size():
-    raw = {**make_scene(2, n=3), "means": np.array([[0, 0, 0], [2, 1, 0], [1, 0.5, -0.25]])}
-    gaussians = to_gaussians(
-        {name: value for name, value in raw.items() if name != "logit_confidence"}
-    )
-    assert repr(gaussians) == "Gaussians(N=3, SH degree 2, box of 2 x 1 x 0.25, motion)"
-    assert (
-        repr(gaussians.select(np.zeros(3, bool))) == "Gaussians(N=0, SH degree 2, box of 0, motion)"
-    )
+    gaussians = replace(cloud(2), means=[(0, 0, 0), (2, 1, 0), *3 * [(1, 0.5, -0.25)]])
+    text = "Gaussians(N=5, SH degree 2, box of 2 x 1 x 0.25, motion, logit_confidence)"
+    assert repr(gaussians) == text
+    assert repr(gaussians.select(np.zeros(5, bool))).startswith("Gaussians(N=0, SH degree 2, box")

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.codec.container import StreamWriter
 from morgs_mi.evaluate.figures import draw_stream, motion_scale
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import GAP
 from tests.assertions import assert_close
-from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
+from tests.scenes.moving_splats import FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
 
 LEGEND = 96
 
@@ -50,6 +49,9 @@ def test_draw_stream__draws_the_stream_alone_without_truth(
     )
     paths = draw_stream(fitted_clip, tmp_path, tmp_path / "capture")
     assert cv2.imread(str(paths[1])).shape == (LEGEND + GAP + HEIGHT, WIDTH + GAP + LEGEND, 3)
+    for folder, scale in ((fitted_clip, PIXELS), (tmp_path, 0.03 * WIDTH)):
+        capture = load_capture(folder / "capture")
+        assert motion_scale(capture, capture.cameras[0]) == pytest.approx(scale)
 
 
 def test_draw_stream__draws_offsets_beside_the_whole_motion(
@@ -68,21 +70,3 @@ def test_draw_stream__draws_offsets_beside_the_whole_motion(
     assert mask.any()
     # A twentieth of it at a tenth of the scale is half saturated.
     assert np.abs(offset[mask] - (255, 127, 127)).max() <= 3
-
-
-def test_motion_scale__is_that_of_the_truth(fitted_clip: Path, tmp_path: Path) -> None:
-    capture = load_capture(fitted_clip / "capture")
-    assert motion_scale(capture, capture.cameras[0]) == pytest.approx(PIXELS)
-    shutil.copytree(
-        fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
-    )
-    assert motion_scale(load_capture(tmp_path / "capture"), capture.cameras[0]) == pytest.approx(
-        0.03 * WIDTH
-    )
-
-
-def test_draw_stream__refuses_a_stream_without_a_frame(fitted_clip: Path, tmp_path: Path) -> None:
-    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25):
-        pass
-    with pytest.raises(ValueError, match=r"got \d+ frames, not all of \[\]"):
-        draw_stream(tmp_path / "s.morgs", tmp_path, fitted_clip / "capture")

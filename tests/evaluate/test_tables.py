@@ -68,7 +68,3 @@ def test_evaluation_summary__holds_the_figures_that_no_table_has(result: Evaluat
     assert motion is not None
     for value, digits in ((result.psnr_slope, 4), (result.playback.fps, 0), (motion.angle, 1)):
         assert figure(value, digits) in text
-
-
-def test_figure__of_unknown_values_is_a_dash() -> None:
-    assert (figure(None, 2), figure(float("nan"), 2), figure(1 / 3, 2)) == ("-", "-", "0.33")

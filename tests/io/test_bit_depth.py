@@ -45,7 +45,7 @@ def test_open_clips__refuses_later_values_above_the_bits_of_cameras(tmp_path: Pa
         list(reader.frames())
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int32, np.int16])
+@pytest.mark.parametrize("dtype", [np.float32, np.int32])
 def test_open_clips__refuses_images_that_have_neither_8_nor_16_bits(tmp_path: Path, dtype) -> None:
     cv2.imwrite(str(tmp_path / "0.tif"), np.full((32, 48, 3), 9, dtype))
     with pytest.raises(ValueError, match=r"0\.tif: expected 8 or 16 bits"):

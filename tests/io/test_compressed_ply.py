@@ -4,6 +4,8 @@ broken files.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.lib.recfunctions import rename_fields
@@ -21,7 +23,7 @@ def round_trip(path, gaussians: Gaussians) -> Gaussians:
     return read_compressed_ply(path)
 
 
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 3])
 def test_read_compressed_ply__returns_what_was_written_up_to_the_steps(tmp_path, degree):
     gaussians = splats(300, degree)
     result = round_trip(tmp_path / "g.compressed.ply", gaussians)
@@ -82,19 +84,10 @@ def test_write_compressed_ply__has_the_bits_of_the_layout(tmp_path):
 
 
 def test_write_compressed_ply__has_bounds_for_each_256(tmp_path):
-    means = np.repeat(np.arange(3.0), 256)[:600, None] * np.ones(3) * 1000 + np.random.default_rng(
-        0
-    ).random((600, 3))
-    many = splats(600)
-    gaussians = Gaussians(
-        means,
-        *(many.numpy()[name] for name in ("log_scales", "quats", "logit_opacities", "sh_coeffs")),
-    )
-    assert_close(
-        round_trip(tmp_path / "g.compressed.ply", gaussians).numpy()["means"],
-        means,
-        atol=0.6 / 1023,
-    )
+    far = 1000 * (np.arange(600) // 256)[:, None]
+    means = far + np.random.default_rng(0).random((600, 3))
+    result = round_trip(tmp_path / "g.compressed.ply", replace(splats(600), means=means))
+    assert_close(result.numpy()["means"], means, atol=0.6 / 1023)
 
 
 def test_write_compressed_ply__writes_a_file_of_no_gaussians(tmp_path):
@@ -129,14 +122,6 @@ def infinite(tables) -> None:
             lambda t: t.update(sh=rename_fields(t["sh"], {"f_rest_8": "f_rest_9"})),
             "got no f_rest_8 of type u1",
         ),
-        (
-            lambda t: t.update(vertex=rename_fields(t["vertex"], {"packed_scale": "scale"})),
-            "got no packed_scale of type u4",
-        ),
-        (
-            lambda t: t.update(chunk=rename_fields(t["chunk"], {"max_scale_x": "x"})),
-            "got no max_scale_x of type f4",
-        ),
         (infinite, "others in 256 of 300 Gaussians .centre of 0, 1, 2 and 253 more."),
     ],
 )
@@ -147,12 +132,3 @@ def test_read_compressed_ply__names_what_is_broken(tmp_path, change, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_splats(path)
     assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize("size", [0, 3, 700, -5])
-def test_read_compressed_ply__names_a_truncated_file(tmp_path, size):
-    path = tmp_path / "g.compressed.ply"
-    write_compressed_ply(path, splats(300))
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(ValueError, match=r"g\.compressed\.ply: expected a complete PLY file"):
-        read_compressed_ply(path)

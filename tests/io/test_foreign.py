@@ -30,7 +30,6 @@ FILES = {
     "c.ply": (SPZ, "SPZ", "splat-transform"),
     "d.bin": (b"NGSP" + bytes(60), "SPZ", "splat-transform"),
     "a.ksplat": (bytes(99), "KSPLAT", "SuperSplat"),
-    "a.SOG": (bytes(99), "SOG", "SuperSplat"),
     "b.ply": (archive("meta.json", "means_l.webp"), "SOG", "SuperSplat"),
     "meta.json": (b"{}", "SOG", "SuperSplat"),
     "e.ply.gz": (gzip.compress(b"ply\n"), "an archive", "unpack it"),
@@ -38,7 +37,6 @@ FILES = {
     "a.gltf": (b'{"extensionsUsed": ["KHR_gaussian_splatting"]}', "glTF", "export it as .ply"),
     "g.splat": (b"ply\nformat ascii 1.0\n", "PLY", "rename it to .ply"),
     "a.usdz": (archive("a.usdc"), "OpenUSD", "export it as .ply"),
-    "a.splatv": (bytes(40), "SPLATV", "export it as .ply"),
     "params.npz": (archive("means.npy"), "an archive of NumPy", "export it as .ply"),
     "chkpnt30000.pth": (archive("data.pkl"), "a checkpoint", "export it as .ply"),
 }

@@ -17,7 +17,7 @@ RGBA = np.dstack(
 )
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".TIFF", ".webp", ".BMP", ".PNG", ".JPEG"])
+@pytest.mark.parametrize("suffix", [".TIFF", ".webp", ".BMP", ".JPEG"])
 def test_folder_reader__reads_every_format_and_upper_case(tmp_path: Path, suffix: str) -> None:
     for t in range(2):
         image = np.full((40, 60, 3), 100 + t, np.uint8)

@@ -49,7 +49,7 @@ def assert_same(a: Gaussians, b: Gaussians, **tolerance: float) -> None:
         )
 
 
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 1, 3])
 def test_read_ply__inverts_write_ply(tmp_path, degree):
     gaussians = random_gaussians(degree=degree)
     write_ply(tmp_path / "g.ply", gaussians)
@@ -57,7 +57,7 @@ def test_read_ply__inverts_write_ply(tmp_path, degree):
     assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=3e-7)
 
 
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 3])
 def test_read_ply__inverts_write_ply_with_all_attributes(tmp_path, degree):
     gaussians = replace(
         to_gaussians(make_unit_scene(degree)), offset=np.arange(30.0).reshape(10, 3)
@@ -80,11 +80,10 @@ def test_write_ply__stores_the_attributes_of_mitsuba(tmp_path):
             assert_close(attributes[name], np.ravel(value), atol=2e-6)  # of the unit quaternions
 
 
-@pytest.mark.parametrize("columns", [10, 6])
-def test_read_ply__refuses_an_odd_number_of_coefficients_of_mitsuba(tmp_path, columns):
+def test_read_ply__refuses_an_odd_number_of_coefficients_of_mitsuba(tmp_path):
     write_ply(tmp_path / "g.ply", to_gaussians(make_unit_scene(1)), layout="mitsuba")
     records = PlyData.read(tmp_path / "g.ply")["vertex"].data
-    records = without(*(f"sh_coeffs_{i}" for i in range(columns, 12)))(records)
+    records = without(*(f"sh_coeffs_{i}" for i in range(10, 12)))(records)
     PlyData([PlyElement.describe(records, "vertex")]).write(str(tmp_path / "h.ply"))
     with pytest.raises(ValueError, match="expected f_rest_0 to f_rest_8"):
         read_ply(tmp_path / "h.ply")
@@ -96,11 +95,6 @@ def test_read_ply__names_an_invalid_motion(tmp_path):
     write_ply(tmp_path / "g.ply", to_gaussians(raw), layout="mitsuba")
     with pytest.raises(ValueError, match=r"others in 1 of 10 Gaussians \(motion of 3\)"):
         read_splats(tmp_path / "g.ply")
-
-
-def test_write_ply__refuses_an_unknown_layout(tmp_path):
-    with pytest.raises(ValueError, match="`layout` must be 3dgs or mitsuba, got 'sog'"):
-        write_ply(tmp_path / "g.ply", random_gaussians(), layout="sog")
 
 
 def test_write_ply__has_the_layout_of_other_tools(tmp_path):
@@ -121,11 +115,11 @@ def test_write_ply__has_the_layout_of_other_tools(tmp_path):
     assert_close([first[name] for name in names], records[0].tolist(), atol=3e-7)
 
 
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize(
     "form",
-    [{"text": True}, {"byte_order": ">"}, {"byte_order": "<"}],
-    ids=["text", "big", "little"],
+    [{"text": True}, {"byte_order": ">"}],
+    ids=["text", "big"],
 )
 def test_read_ply__accepts_files_of_other_tools(tmp_path, degree, form):
     gaussians = random_gaussians(degree=degree)
@@ -144,12 +138,13 @@ def test_read_ply__accepts_files_of_other_tools(tmp_path, degree, form):
     assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=1e-6 if "text" in form else 0)
 
 
-def test_read_ply__bounds_the_infinite_numbers_of_opaque_and_flat_gaussians(tmp_path):
+def test_read_ply__bounds_the_infinite_numbers_of_opaque_and_flat_gaussians(tmp_path, caplog):
     records = table(random_gaussians(3))
     records["opacity"][:2] = np.inf, -np.inf
     records["scale_2"][0] = -np.inf
     PlyData([PlyElement.describe(records, "vertex")]).write(str(tmp_path / "g.ply"))
-    gaussians = read_ply(tmp_path / "g.ply")
+    gaussians = read_splats(tmp_path / "g.ply")
+    assert not caplog.records
     assert_close(np.array(gaussians.opacities)[:2], [1, 0], atol=1e-6)
     assert 0 < np.array(gaussians.scales)[0, 2] < 1e-29
     assert gaussians.numpy()["logit_opacities"][2] == records["opacity"][2]
@@ -169,45 +164,13 @@ def without(*names):
     )
 
 
-def with_nan(records):
-    records["scale_1"][3] = np.nan
-    return records
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            without("rot_3", "opacity"),
-            "without opacity, rot_3, as of a mesh or a point cloud; export the Gaussians",
-        ),
-        (without("f_rest_4"), "expected f_rest_0 to f_rest_8, 23, 44 or none, got 44 of them"),
-        (
-            with_nan,
-            r"expected finite numbers of at most 1e\+12, others in 1 of 20 Gaussians \(size of "
-            r"3\); leave them out",
-        ),
-    ],
-)
-def test_read_ply__refuses_files_that_it_cannot_read(tmp_path, change, message):
-    vertices = change(table(random_gaussians()))
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "g.ply"))
-    with pytest.raises(ValueError, match=message):
-        read_splats(tmp_path / "g.ply")
-
-
-@pytest.mark.parametrize("size", [0, 3, 60, -5])
+@pytest.mark.parametrize("size", [60, -5])
 def test_read_ply__names_a_truncated_file(tmp_path, size):
     path = tmp_path / "g.ply"
     write_ply(path, random_gaussians())
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(ValueError, match=r"g\.ply: expected a complete PLY file"):
         read_ply(path)
-
-
-def test_read_ply__names_a_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="expected a PLY file, found none"):
-        read_ply(tmp_path / "none.ply")
 
 
 def test_write_ply__writes_a_file_of_no_gaussians(tmp_path):

@@ -9,7 +9,6 @@ import pytest
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.io.compressed_ply import write_compressed_ply
-from morgs_mi.io.ply import write_ply
 from morgs_mi.io.splats import read_splats
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
@@ -35,13 +34,6 @@ def test_read_splats__recognises_a_compressed_ply(tmp_path, name):
     assert len(read_splats(tmp_path / name)) == len(splats())
 
 
-def test_read_splats__reads_an_uncompressed_ply(tmp_path):
-    write_ply(tmp_path / "a.ply", splats())
-    np.testing.assert_array_equal(
-        read_splats(tmp_path / "a.ply").numpy()["means"], splats().numpy()["means"]
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -51,12 +43,6 @@ def test_read_splats__reads_an_uncompressed_ply(tmp_path):
             RECORD.pack(*(0,) * 14) + RECORD.pack(np.nan, *(0,) * 13),
             "others in 1 of 2 Gaussians .centre of 1.",
         ),
-        (
-            "a.splat",
-            RECORD.pack(*(0,) * 3, -1, *(0,) * 10),
-            "others in 1 of 1 Gaussians .size of 0.",
-        ),
-        ("a.ply", b"", "expected a complete PLY file, .* it does not begin with `ply`"),
         ("a.ply", b"ply\nformat ascii 1.0\n", "its header does not end"),
         ("a.xyz", b"", r"name that ends in .compressed.ply, .ply, .splat, got '.xyz'"),
     ],

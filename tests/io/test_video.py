@@ -39,9 +39,16 @@ def test_write_video__is_lossless_by_default(tmp_path: Path, name: str) -> None:
     reader = open_frames(tmp_path / name)
     assert (reader.num_frames, reader.width, reader.height) == (COUNT, WIDTH, HEIGHT)
     assert reader.fps == (12.5 if "." in name else None)
+    assert reader.num_held == COUNT
     np.testing.assert_array_equal(list(reader.frames()), clip())
     np.testing.assert_array_equal(list(reader.frames(2, 5)), clip()[2:5])
     assert [f.name for f in tmp_path.iterdir()] == [name]
+
+
+def test_folder_reader__reads_in_numerical_order(tmp_path: Path) -> None:
+    for i, frame in enumerate(clip(count=12)):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), frame[..., ::-1])
+    np.testing.assert_array_equal(list(FolderReader.open(tmp_path).frames()), clip(count=12))
 
 
 @pytest.mark.parametrize("codec", ["mp4v", PLAYABLE])
@@ -62,9 +69,7 @@ def long_video(path: Path, codec: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "name", ["a.mp4 mpg2", "a.mkv mpg2", "a.mp4 vp09", "a.mp4 mp4v", "a.mkv FFV1", "a.avi mpg2"]
-)
+@pytest.mark.parametrize("name", ["a.mp4 mpg2", "a.mkv mpg2", "a.avi mpg2"])
 def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(
     tmp_path: Path, name: str
 ) -> None:
@@ -79,13 +84,7 @@ def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(
     assert 0 < next(reader._numbered(150))[0] <= 150
     late = list(reader.pick([155, 158, 160]))
     np.testing.assert_array_equal(late[:2], [whole[155], whole[158]])
-    assert isinstance(late[2], ValueError)
-
-
-def test_folder_reader__reads_in_numerical_order(tmp_path: Path) -> None:
-    for i, frame in enumerate(clip(count=12)):
-        cv2.imwrite(str(tmp_path / f"{i}.png"), frame[..., ::-1])
-    np.testing.assert_array_equal(list(FolderReader.open(tmp_path).frames()), clip(count=12))
+    assert "it has ended after 160 frames" in str(late[2])
 
 
 def truncated(path: Path, length: int) -> Path:
@@ -99,12 +98,13 @@ def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the
     path = tmp_path / "cam.mkv"
     write_video(path, clip(), 30)
     reader = VideoReader.open(truncated(path, path.stat().st_size // 2))
+    assert reader.num_frames == COUNT
     frames = []
     with pytest.raises(
         ValueError, match=rf"cam.mkv: frame \d of {COUNT} cannot be decoded.*max_frames"
     ):
         frames.extend(reader.frames())
-    assert 0 < len(frames) < COUNT
+    assert 0 < len(frames) == reader.num_held < COUNT
     np.testing.assert_array_equal(frames, clip()[: len(frames)])
 
 
@@ -114,21 +114,9 @@ def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the
         ("cam.mp4", Path.unlink, FileNotFoundError, "cam.mp4: expected a video file, found none"),
         (
             "cam.mp4",
-            lambda path: truncated(path, 0),
-            ValueError,
-            "cam.mp4: expected a video, got 0 bytes",
-        ),
-        (
-            "cam.mp4",
             lambda path: truncated(path, path.stat().st_size // 2),
             ValueError,
             r"cam.mp4: expected a video, got \d+ bytes .*\(Invalid data .* truncated",
-        ),
-        (
-            "cam",
-            lambda path: [file.unlink() for file in path.iterdir()],
-            FileNotFoundError,
-            r"cam: expected images \(.png",
         ),
         (
             "cam",
@@ -159,40 +147,36 @@ def test_open_frames__refuses_bad_input(
         list(open_frames(tmp_path / name).frames())
 
 
-def test_pick__reports_every_frame_behind_the_end(tmp_path: Path) -> None:
-    write_video(tmp_path / "cam.mkv", clip(), 30)
-    (last, *rest) = VideoReader.open(tmp_path / "cam.mkv").pick([5, 6, 99])
-    assert isinstance(last, np.ndarray)
-    assert ["it has ended after 6 frames" in str(error) for error in rest] == [True, True]
-
-
-def test_video_reader__counts_the_frames_of_a_truncated_file(tmp_path: Path) -> None:
-    for name, codec in (("cam.mp4", "FFV1"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")):
-        write_video(tmp_path / name, clip(), 30, codec)
-        reader = open_frames(tmp_path / name)
-        assert reader.num_held == reader.num_frames == len(clip())
-    truncated(tmp_path / "cam.mkv", (tmp_path / "cam.mkv").stat().st_size * 2 // 3)
-    reader = open_frames(tmp_path / "cam.mkv")
-    assert reader.num_frames == len(clip())
-    assert 0 < reader.num_held < len(clip())
-    assert len(list(reader.frames(0, reader.num_held))) == reader.num_held
-
-
-def test_video_reader__has_the_positions_of_a_variable_frame_rate(tmp_path: Path) -> None:
-    path = tmp_path / "cam.mp4"
-    write_timed_video(path, clip(), [0, 33, 67, 200, 233, 267])
-    reader = VideoReader.open(path)
+@pytest.mark.parametrize(
+    ("name", "codec", "times", "fps", "error"),
+    [
+        ("cam.mp4", "ffv1", [0, 33, 67, 200, 233, 267], 30, 0),
+        ("cam.avi", "mjpeg", [0, 40, 80, 240, 280, 320], 25, 6),
+    ],
+)
+def test_video_reader__has_the_positions_of_a_variable_frame_rate(
+    tmp_path: Path, name: str, codec: str, times: list[int], fps: float, error: float
+) -> None:
+    """In AVI files, a recorder writes an empty chunk for each frame that it drops."""
+    write_timed_video(tmp_path / name, smooth_clip(), times, codec)
+    reader = VideoReader.open(tmp_path / name)
     assert (reader.num_frames, reader.num_held) == (6, 6)
-    assert reader.fps == pytest.approx(30, rel=0.01)
+    assert reader.fps == pytest.approx(fps, rel=0.01)
     assert reader.positions is not None
     np.testing.assert_allclose(reader.positions, [0, 1, 2, 6, 7, 8], atol=0.05)
-    np.testing.assert_array_equal(list(reader.frames()), clip())
+    for image, expected in zip(reader.frames(), smooth_clip(), strict=True):
+        assert np.abs(np.int16(image) - expected).mean() <= error
 
 
 @pytest.mark.parametrize(
-    ("name", "codec"), [("cam.mp4", "mp4v"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")]
+    ("name", "codec", "fps"),
+    [
+        ("cam.mp4", "mp4v", 29.97),
+        ("cam.mkv", "FFV1", 24000 / 1001),
+        ("cam.mkv", "FFV1", 240),
+        ("cam.avi", "MJPG", 29.97),
+    ],
 )
-@pytest.mark.parametrize("fps", [24000 / 1001, 29.97, 240])
 def test_video_reader__recognises_a_constant_frame_rate(
     tmp_path: Path, name: str, codec: str, fps: float
 ) -> None:
@@ -228,16 +212,6 @@ def test_video_reader__reads_the_containers_and_codecs_of_cameras(
     assert reader.fps == pytest.approx(25)
     levels = [frame.mean() for frame in reader.frames()]
     np.testing.assert_allclose(levels, 30 + 12 * np.arange(16), atol=4)
-
-
-def test_video_reader__leaves_a_gap_for_the_null_frames_of_an_avi(tmp_path: Path) -> None:
-    """A recorder writes an empty chunk for each frame that it drops."""
-    times = [0, 40, 80, 240, 280, 320]
-    write_timed_video(tmp_path / "a.avi", smooth_clip(), times, "mjpeg")
-    reader = VideoReader.open(tmp_path / "a.avi")
-    assert (reader.num_frames, reader.num_held) == (6, 6)
-    assert reader.positions is not None
-    np.testing.assert_allclose(reader.positions, [0, 1, 2, 6, 7, 8], atol=0.01)
 
 
 def test_video_reader__leaves_out_a_broken_frame_and_no_other(tmp_path: Path) -> None:
@@ -278,14 +252,13 @@ def test_video_reader__turns_images_as_players_do(tmp_path: Path) -> None:
     np.testing.assert_array_equal(next(reader.frames()), np.rot90(image, -1))
 
 
-@pytest.mark.parametrize("folder", ["12:30:00", "./12:30:00"])
 def test_video_reader__takes_a_colon_as_part_of_a_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In names of recorders, which a program could take for a protocol; written and read."""
     monkeypatch.chdir(tmp_path)
-    write_video(f"{folder}/a.mkv", clip(), 30)
-    assert open_frames(f"{folder}/a.mkv").num_frames == COUNT
+    write_video("12:30:00/a.mkv", clip(), 30)
+    assert open_frames("12:30:00/a.mkv").num_frames == COUNT
 
 
 def test_video_reader__names_an_unknown_codec(tmp_path: Path) -> None:
@@ -326,15 +299,7 @@ def interrupted():
     ("name", "frames", "codec", "error", "message"),
     [
         ("cam.mp4", [], "FFV1", ValueError, "at least one frame was expected"),
-        ("cam", [], "FFV1", ValueError, "at least one frame was expected"),
         ("cam.mp4", clip(31), "FFV1", ValueError, r"of even sizes, got uint8 .31, 48, 3."),
-        (
-            "cam.mp4",
-            [clip()[0].astype(float)],
-            "FFV1",
-            ValueError,
-            r"frame 0 must be uint8 .* got float64",
-        ),
         (
             "cam.mp4",
             [clip()[0], clip(30)[0]],
@@ -342,7 +307,6 @@ def interrupted():
             ValueError,
             r"frame 1 must be .*\[32, 48, 3\] .*, got uint8 \[30",
         ),
-        ("cam.mp4", clip(), "av01", OSError, "no encoder 'av01'"),
         ("cam.mp4", interrupted(), "FFV1", KeyboardInterrupt, "Ctrl-C"),
     ],
 )
@@ -355,16 +319,14 @@ def test_write_video__leaves_nothing_on_failure(
 
 
 def test_write_video__leaves_the_old_file_on_failure(tmp_path: Path) -> None:
-    write_video(tmp_path / "cam.mp4", clip(), 30)
-    with pytest.raises(ValueError, match="at least one frame"):
-        write_video(tmp_path / "cam.mp4", [], 30)
-    assert VideoReader.open(tmp_path / "cam.mp4").num_frames == COUNT
-    write_video(tmp_path / "cam", clip(), 30)
-    with pytest.raises(FileExistsError, match="cam: expected a new folder"):
-        write_video(tmp_path / "cam", clip(), 30)
+    for name, error in (("cam.mp4", ValueError), ("cam", FileExistsError)):
+        write_video(tmp_path / name, clip(), 30)
+        with pytest.raises(error, match=r"at least one frame|cam: expected a new folder"):
+            write_video(tmp_path / name, [], 30)
+        assert open_frames(tmp_path / name).num_frames == COUNT
 
 
-@pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
+@pytest.mark.parametrize("name", ["cam.mp4", "cam"])
 def test_write_video__raises_and_leaves_nothing_on_a_full_disk(tmp_path: Path, name: str) -> None:
     with pytest.raises(OSError, match=name), files_end_at(3000):
         write_video(tmp_path / name, clip(), 30)

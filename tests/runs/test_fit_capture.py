@@ -21,17 +21,16 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, Packet, StreamWriter
 from morgs_mi.codec.frame_source import play
-from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.fit_names import PROVISIONAL
 from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next
 from morgs_mi.runs.fit_files import Recording as Files
-from morgs_mi.runs.fit_files import _without_folder, stream_metadata
+from morgs_mi.runs.fit_files import stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
@@ -180,11 +179,8 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full"), RuntimeError("crash")]
-)
 def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
-    whole: Path, tmp_path: Path, error: BaseException
+    whole: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     shutil.copytree(whole, out)
@@ -193,9 +189,9 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
         assert {name: data for name, data in files_of(out).items() if name[0] != "."} == files_of(
             whole
         )
-        raise error
+        raise OSError(errno.ENOSPC, "full")
 
-    with pytest.raises(type(error)):
+    with pytest.raises(OSError, match="full"):
         other_fit(out, fail)
     assert files_of(out) == files_of(whole)
     stream_capture(recording(), out, CONFIG, resume=True)
@@ -274,30 +270,6 @@ def test_stream_capture__killed_60_times_is_the_same(whole: Path, tmp_path: Path
     kill_and_resume(whole, tmp_path, 60)
 
 
-@pytest.mark.long
-def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> None:
-    """A reader gets the state of the loop after each frame, with births and deaths, from any frame
-    on.
-    """
-    capture = recording(num_frames=300)
-    loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, CONFIG)
-    states: list[CodedFrame] = []
-    with StreamWriter(tmp_path / "s", capture.cameras, 25) as writer:
-        for frame in capture.partial_frames():
-            packet, _ = loop.push(frame.images)
-            writer.write(packet)
-            assert loop.state.coded is not None
-            states.append(loop.state.coded)
-            if frame.index and frame.index % 50 == 0:
-                writer.write(reemitted_keyframe(states[-1]))
-    assert states[0].next_id < states[-1].next_id, "some were born"
-    assert len(states[-1]) < states[-1].next_id, "some died"
-    reader = StreamReader(tmp_path / "s")
-    assert history(coded_frames(reader)) == history(states)
-    for frame in range(0, 300, 23):
-        assert history([reader.seek(frame)]) == history([states[frame]])
-
-
 def cuts(whole: Path) -> list[int]:
     """Return bytes within and between packets of every kind."""
     index = StreamReader(whole / "stream.morgs").index()
@@ -369,13 +341,7 @@ def brighter(capture: Recording) -> Recording:
             replace(CONFIG, seed=1),
             r"resume a fit with metadata\.config\.seed = 0, got 1",
         ),
-        (
-            recording(),
-            replace(CONFIG, codec=CodecConfig(quality=2)),
-            r"metadata\.config\.codec\.quality = 1\.0, got 2",
-        ),
         (brighter(recording()), CONFIG, r"resume a fit with metadata\.fingerprint = "),
-        (recording(fps=50.0), CONFIG, r"resume a fit with fps = 25\.0, got 50\.0"),
         (recording(cameras=recording().cameras[::-1]), CONFIG, "resume a fit with cameras = "),
     ],
 )
@@ -391,13 +357,6 @@ def test_stream_capture__does_not_resume_another_fit(
 
 def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
-    report = (out / "report.json").rename(out / "moved")
-    with pytest.raises(
-        ValueError,
-        match=r"report\.json: expected the report of \d+ frames, got none or a broken one",
-    ):
-        stream_capture(recording(), out, CONFIG, resume=True)
-    report.rename(out / "report.json")
     damaged = bytearray(stream_of(whole))
     damaged[len(damaged) // 2] ^= 1
     (out / "stream.morgs").write_bytes(damaged)
@@ -428,7 +387,7 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
+@pytest.mark.parametrize("change", ["removed", "moved", "replaced"])
 def test_stream_capture__ends_when_its_stream_is_taken_away(
     whole: Path, tmp_path: Path, change: str
 ) -> None:
@@ -465,25 +424,21 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(
         assert_same(tmp_path / "moved", whole)
 
 
-@pytest.mark.slow
-def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
+def test_stream_metadata__has_no_path(tmp_path: Path) -> None:
     """A stream is shared; its capture is named in the file beside it."""
     secret = tmp_path / "home" / "jane"
-    methods = replace(CONFIG.motion, flow_method=f"files:{secret}/flow", mask_method="none")
+    methods = replace(
+        CONFIG.motion,
+        flow_method=f"files:{secret}/flow",
+        mask_method=f"sam2:{secret}/encoder.onnx,{secret}/decoder.onnx",
+    )
     capture = recording(path=secret / "clip")
     header = stream_metadata(
         capture, next(capture.partial_frames()), replace(CONFIG, motion=methods)
     )
     assert "jane" not in json.dumps(header)
     assert header["config"]["motion"]["flow_method"] == "files:flow"
-    assert (
-        _without_folder("sam2:/a/encoder.onnx,/b/decoder.onnx") == "sam2:encoder.onnx,decoder.onnx"
-    )
-    stream_capture(capture, tmp_path / "out", CONFIG)
-    assert b"jane" not in stream_of(tmp_path / "out")
-    assert json.loads((tmp_path / "out" / "capture.json").read_text())["capture"] == str(
-        secret / "clip"
-    )
+    assert header["config"]["motion"]["mask_method"] == "sam2:encoder.onnx,decoder.onnx"
 
 
 @pytest.mark.slow
@@ -517,22 +472,21 @@ def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_p
     [
         ("{", "expected JSON, got a broken file"),
         ('{"frames": []}', "expected the report of 6 frames, got none or a broken one .0 rows"),
-        ("[]", "expected the report of 6 frames, got none or a broken one"),
-        (
-            '{"frames": [{"seconds": "many"}]}',
-            "expected the report of 6 frames, got none or a broken one",
-        ),
         (
             f'{{"frames": [{{"seconds": {10**400}}}]}}',
             "expected the report of 6 frames, got none or a broken one",
         ),
+        (None, "expected the report of 6 frames, got none or a broken one"),
     ],
+    ids=["broken", "empty", "large", "missing"],
 )
-def test_stream_capture__refuses_a_hostile_report(
-    whole: Path, tmp_path: Path, text: str, message: str
+def test_stream_capture__refuses_a_hostile_or_missing_report(
+    whole: Path, tmp_path: Path, text: str | None, message: str
 ) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
-    (out / "report.json").write_text(text)
+    (out / "report.json").unlink()
+    if text is not None:
+        (out / "report.json").write_text(text)
     with pytest.raises(ValueError, match=f"report.json: {message}"):
         stream_capture(recording(), out, CONFIG, resume=True)
 
@@ -548,7 +502,7 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
         forged = forge(clip, np.random.default_rng(case))
         shutil.rmtree(out, ignore_errors=True)
         shutil.copytree(whole, out)
-        (out / "stream.morgs").write_bytes(forged if isinstance(forged, bytes) else forged.data)
+        (out / "stream.morgs").write_bytes(forged)
         refusal = ""
         try:
             stream_capture(recording(), out, CONFIG, resume=True)
@@ -568,11 +522,6 @@ def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path: 
     ):
         stream_capture(recording(), out, CONFIG)
     assert (capture / "capture.json").read_text() == "{}"
-
-
-def test_with_next__pairs_each_frame_with_its_successor() -> None:
-    assert list(with_next(iter("abc"))) == [("a", "b"), ("b", "c"), ("c", None)]
-    assert list(with_next([])) == []
 
 
 def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
@@ -621,9 +570,7 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_f
     assert stream_of(tmp_path) == whole
 
 
-@pytest.mark.parametrize(
-    "distortion", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}]
-)
+@pytest.mark.parametrize("distortion", [[1, 2], {"cam1": ["x", "y"]}])
 def test_as_fitted__refuses_broken_distortions(tmp_path, distortion):
     capture = recording()
     with StreamWriter(

@@ -213,21 +213,12 @@ def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
 
 
 def test_exr_channels__names_follow_the_number_of_components():
-    sizes = {"color": 3, "alpha": 1, "wetness": 1, "offset": 2, "normal": 3, "wide": 5}
-    images = {
-        name: np.random.default_rng(0).uniform(size=(2, 3, size)) for name, size in sizes.items()
-    }
-    planes = exr_channels(images)
-    wide = [f"wide.{i}" for i in range(5)]
+    images = {name: np.zeros((2, 3, k)) for name, k in (("wet", 1), ("normal", 3), ("wide", 5))}
     normal = ["normal.X", "normal.Y", "normal.Z"]
-    assert list(planes) == ["R", "G", "B", "A", "wetness.Y", "offset.X", "offset.Y", *normal, *wide]
-    np.testing.assert_array_equal(planes["offset.Y"], images["offset"][..., 1])
+    assert list(exr_channels(images)) == ["wet.Y", *normal, *(f"wide.{i}" for i in range(5))]
 
 
 def test_pad_to_even__repeats_the_last_row_and_column():
     image = np.arange(45, dtype=np.uint8).reshape(3, 5, 3)
-    padded = pad_to_even(image)
-    assert padded.shape == (4, 6, 3)
-    np.testing.assert_array_equal(padded[:3, :5], image)
-    np.testing.assert_array_equal(padded[3, 5], image[2, 4])
-    np.testing.assert_array_equal(pad_to_even(padded), padded)
+    repeated = image[[0, 1, 2, 2]][:, [0, 1, 2, 3, 4, 4]]
+    np.testing.assert_array_equal(pad_to_even(image), repeated)

@@ -479,15 +479,6 @@ def hosted(clip, tmp_path):
         yield f"{address}/index.html#pause", open_stream(tmp_path / "web")
 
 
-def test_page__names_a_truncated_stream(browser, hosted):
-    address, stream = hosted
-    data = stream.path.read_bytes()
-    stream.path.write_bytes(data[: stream.index()[2][2] + 100])
-    with Player(browser, address) as page:
-        assert "truncated or damaged at byte" in page.text("#message")
-        assert page.text("#count") == "1 / 1"
-
-
 def test_page__names_what_is_no_stream(browser, hosted):
     address, stream = hosted
     data = bytearray(stream.path.read_bytes())

@@ -418,7 +418,7 @@ def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
     wrong = []
     for seed in range(6):
         forged = forge(short_clip(), np.random.default_rng(seed))
-        path.write_bytes(forged if isinstance(forged, bytes) else forged.data)
+        path.write_bytes(forged)
         try:
             viewer = Viewer(open_stream(path))
         except ValueError as error:

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.packets import decode, reemitted_keyframe
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.tasks import ChunkConfig, fit_boundary_frame
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.recording import CONFIG, recording
@@ -38,10 +36,3 @@ def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
     first, second = (ChunkConfig().fit_config(CONFIG, number) for number in (0, 1))
     assert first.seed != second.seed
     assert first.fit.rates.scales == pytest.approx(2 * CONFIG.fit.rates.scales)
-
-
-def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
-    config_of_fit = StreamConfig(fit=FitConfig(epochs=3))
-    config = ChunkConfig().overlap_config(config_of_fit)
-    assert config.fit.epochs == 6
-    assert replace(config, fit=config_of_fit.fit) == config_of_fit
