@@ -23,9 +23,7 @@ from morgs_mi.cli.console import (
 )
 
 
-def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress__prints_a_line_every_30_seconds_without_a_terminal(capsys, monkeypatch):
     clock = 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: clock)
     with progress() as report:
@@ -41,9 +39,7 @@ def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
     ]
 
 
-def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(capsys, monkeypatch):
     clock = 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: clock)
     with progress() as report:
@@ -58,9 +54,7 @@ def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(
     ]
 
 
-def test_print_table__is_as_wide_as_its_content_without_a_terminal(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_print_table__is_as_wide_as_its_content_without_a_terminal(capsys):
     table = Table("camera", "x" * 60)
     table.add_row("a_camera_with_a_name_of_50_characters_or_a_few_more", "y" * 70)
     print_table(table)
@@ -75,7 +69,7 @@ def test_print_table__is_as_wide_as_its_content_without_a_terminal(
 HOSTILE = "a\x1b[2J\x9b\x7f\udcff\u202e[red]b"
 
 
-def test_console__prints_control_characters_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+def test_console__prints_control_characters_escaped(capsys):
     table = Table(HOSTILE, title=HOSTILE)
     table.add_row(HOSTILE)
     print_result(HOSTILE + "\nb")
@@ -88,12 +82,12 @@ def test_console__prints_control_characters_escaped(capsys: pytest.CaptureFixtur
     assert printed.err == f"{escaped} b\n"
 
 
-def test_printable__changes_no_text_and_no_toml() -> None:
+def test_printable__changes_no_text_and_no_toml():
     assert printable("é ✓ 日本\n") == "é ✓ 日本\n"
     assert tomllib.loads(printable('a = "\x9b\U000e0001"')) == {"a": "\x9b\U000e0001"}
 
 
-def test_LogHandler__prints_one_line_with_the_level(capsys: pytest.CaptureFixture[str]) -> None:
+def test_LogHandler__prints_one_line_with_the_level(capsys):
     LogHandler().emit(
         logging.LogRecord("name", logging.WARNING, "", 0, "%s: [left out]", ("cam1" * 40,), None)
     )
@@ -120,7 +114,7 @@ def test_LogHandler__prints_one_line_with_the_level(capsys: pytest.CaptureFixtur
         ),
     ],
 )
-def test_sentence_of__has_no_number_and_no_function(error: Exception, sentence: str) -> None:
+def test_sentence_of__has_no_number_and_no_function(error, sentence):
     assert sentence_of(error, {"overwrite": "--overwrite"}) == sentence
 
 
@@ -135,5 +129,5 @@ def test_sentence_of__has_no_number_and_no_function(error: Exception, sentence: 
         ("f(): `x.a` must be 1.", "--x-a must be 1."),
     ],
 )
-def test_with_option_names__changes_only_arguments(sentence: str, expected: str) -> None:
+def test_with_option_names__changes_only_arguments(sentence, expected):
     assert with_option_names(sentence, {"a": "--a", "x.a": "--x-a"}, "clip") == expected

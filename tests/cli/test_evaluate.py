@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +12,7 @@ from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording
 
 
-def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) -> None:
+def test_eval__replaces_no_file_of_the_fit(stream, tmp_path, run):
     for name in ("good.morgs", "report.json", "capture.json"):
         assert_refused(
             run("eval", stream, "--json", tmp_path / name),
@@ -22,9 +21,7 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
 
 
 @pytest.mark.slow
-def test_eval__says_that_a_first_frame_is_provisional(
-    tmp_path: Path, run, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_eval__says_that_a_first_frame_is_provisional(tmp_path, run, caplog):
     clip = write_recording(tmp_path / "clip", 1)
     out = tmp_path / "out"
     assert run("fit", clip, out, *OPTIONS)[0] == 0
@@ -36,9 +33,7 @@ def test_eval__says_that_a_first_frame_is_provisional(
     assert [sentence in message for message in caplog.messages] == [True, True]
 
 
-def test_eval__reports_a_hostile_report_in_one_sentence(
-    fitted_clip: Path, tmp_path: Path, run
-) -> None:
+def test_eval__reports_a_hostile_report_in_one_sentence(fitted_clip, tmp_path, run):
     shutil.copy(fitted_clip / "stream.morgs", tmp_path)
     report = f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}'
     (tmp_path / "report.json").write_text(report)

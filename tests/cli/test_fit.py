@@ -37,8 +37,8 @@ from tests.scenes.recording import write_recording
 
 @pytest.mark.slow
 def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
-    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, tmp_path, run, monkeypatch
+):
     whole = shutil.copy(capture / "cam1.mkv", tmp_path / "whole.mkv")
     truncate_clip(capture)
     opened = VideoReader.open
@@ -57,7 +57,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
 
 
 @pytest.mark.slow
-def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
+def test_fit__balances_cameras_of_other_exposure(tmp_path, run):
     path = textured.write_capture(tmp_path / "rig").path
     camera = textured.rig(shift=7)[2]
     light = decode_light(textured.render(camera, textured.textures()) / 255)
@@ -72,7 +72,7 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
 
 
 @pytest.mark.slow
-def test_fit__and_eval_use_the_same_timestamps(capture: Path, tmp_path: Path, run) -> None:
+def test_fit__and_eval_use_the_same_timestamps(capture, tmp_path, run):
     lengthen_clip(capture)
     out = tmp_path / "out"
     options = ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
@@ -100,8 +100,8 @@ def before_frame_2(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) 
 
 @pytest.mark.slow
 def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
-    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, run, monkeypatch
+):
     clip = write_recording(tmp_path / "clip", 12)
     out = tmp_path / "out"
     fit = ("fit", clip, out, *OPTIONS)
@@ -146,9 +146,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
         ),
     ],
 )
-def test_fit__rejects_bad_input_in_one_sentence(
-    capture: Path, tmp_path: Path, run, args, parts
-) -> None:
+def test_fit__rejects_bad_input_in_one_sentence(capture, tmp_path, run, args, parts):
     if "cuda_ad_rgb" in args and Path("/dev/nvidiactl").exists():
         pytest.skip("this machine has a GPU")
     option, value, *more = args
@@ -159,7 +157,7 @@ def test_fit__rejects_bad_input_in_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_fit__rejects_arguments_that_cannot_be_parsed(tmp_path: Path, capsys) -> None:
+def test_fit__rejects_arguments_that_cannot_be_parsed(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["fit", str(tmp_path), str(tmp_path / "out"), "--epochs", "many"])
     assert stop.value.code == 2
@@ -174,13 +172,8 @@ def test_fit__rejects_arguments_that_cannot_be_parsed(tmp_path: Path, capsys) ->
     [(("cam1",), (1,)), (("cam2", "0"), (0, 2)), (("auto",), ())],
 )
 def test_fit__takes_the_held_out_camera_by_index_or_name(
-    capture: Path,
-    tmp_path: Path,
-    run,
-    monkeypatch: pytest.MonkeyPatch,
-    view: tuple[str, ...],
-    test_views: tuple[int, ...],
-) -> None:
+    capture, tmp_path, run, monkeypatch, view, test_views
+):
     assert (
         fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", *view).test_views
         == test_views
@@ -202,9 +195,7 @@ def fitted_capture(
     return passed[0]
 
 
-def test_fit__refuses_to_leave_fewer_than_32_pixels(
-    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path, run, monkeypatch):
     clip = colmap(tmp_path / "clip")  # 62x46
     assert_refused(
         run("fit", clip, tmp_path / "out", "--downscale", 1.5),
@@ -230,13 +221,8 @@ def clean_up(*_: object) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("interrupted", [partial(signal.raise_signal, signal.SIGTERM), clean_up])
 def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
-    capture: Path,
-    tmp_path: Path,
-    run,
-    monkeypatch: pytest.MonkeyPatch,
-    interrupted: Callable[[], None],
-    heeds_interrupts: None,
-) -> None:
+    capture, tmp_path, run, monkeypatch, interrupted, heeds_interrupts
+):
     before_frame_2(monkeypatch, interrupted)
     args = ["fit", str(capture), str(tmp_path / "my out"), *OPTIONS]
     status, _, error = run(*args)
@@ -253,8 +239,8 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
 
 
 def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
-    capture: Path, stream: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, stream, tmp_path, run, monkeypatch
+):
     (tmp_path / "out").mkdir()
     stream.rename(tmp_path / "out" / "stream.morgs")
     monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
@@ -264,9 +250,7 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
     assert len(StreamReader(tmp_path / "out" / "stream.morgs").index()) == 2
 
 
-def test_fit__reports_progress_before_the_first_frame(
-    capture: Path, tmp_path: Path, run, monkeypatch
-) -> None:
+def test_fit__reports_progress_before_the_first_frame(capture, tmp_path, run, monkeypatch):
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
     clock = iter(range(0, 10**9, 40))
     monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(clock)))
@@ -278,7 +262,7 @@ def test_fit__reports_progress_before_the_first_frame(
 
 
 @pytest.mark.slow
-def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: Path) -> None:
+def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture, tmp_path):
     """The second packet does not fit: the file ends with the first and still has the intended
     number of frames.
     """
@@ -310,8 +294,8 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_cameras(
-    tmp_path: Path, run
-) -> None:
+    tmp_path, run
+):
     clip = write_recording(tmp_path / "clip", 2)
     for image in clip.glob("cam*/0000.png"):
         write_png(image, np.zeros((24, 32, 3), np.uint8))
@@ -328,8 +312,8 @@ def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_c
 
 @pytest.mark.slow
 def test_fit__fits_chunks_side_by_side_and_names_what_stands_when_interrupted(
-    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    tmp_path, run, monkeypatch, caplog
+):
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     short = ChunkConfig(passes=1, epochs=1)
     monkeypatch.setattr(ChunkConfig.__init__, "__defaults__", astuple(short))

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -15,19 +14,17 @@ from morgs_mi import cli
 from morgs_mi.loop.stream_config import PresetName
 
 
-def test_main__prints_the_version(run) -> None:
+def test_main__prints_the_version(run):
     assert run("--version") == (0, f"morgs-mi {version('morgs-mi')}\n", "")
 
 
-def test_main__names_standard_output_if_the_version_does_not_fit(
-    run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_main__names_standard_output_if_the_version_does_not_fit(run, monkeypatch):
     with open("/dev/full", "w") as full:
         monkeypatch.setattr("sys.stdout", full)
         assert run("--version")[::2] == (1, "standard output: No space left on device.\n")
 
 
-def test_main__ends_silently_if_the_reader_of_its_output_has() -> None:
+def test_main__ends_silently_if_the_reader_of_its_output_has():
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "morgs_mi", "--help"]
@@ -36,7 +33,7 @@ def test_main__ends_silently_if_the_reader_of_its_output_has() -> None:
     assert (result.returncode, result.stderr) == (141, b"")
 
 
-def test_main__writes_the_completion_of_a_shell(tmp_path: Path) -> None:
+def test_main__writes_the_completion_of_a_shell(tmp_path):
     with pytest.raises(SystemExit) as stop:
         cli.main(["--tyro-write-completion", "bash", str(tmp_path / "morgs-mi.bash")])
     assert not stop.value.code
@@ -47,14 +44,14 @@ def test_main__writes_the_completion_of_a_shell(tmp_path: Path) -> None:
     ("words", "commands"),
     [(["export", "plly", "out"], "ply, gltf, usd")],
 )
-def test_main__lists_the_commands_in_place_of_a_mistyped_one(words, commands, capsys) -> None:
+def test_main__lists_the_commands_in_place_of_a_mistyped_one(words, commands, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(words)
     assert stop.value.code == 2
     assert commands in capsys.readouterr().err
 
 
-def test_fit__lists_all_presets_in_its_help(capsys) -> None:
+def test_fit__lists_all_presets_in_its_help(capsys):
     with pytest.raises(SystemExit):
         cli.main(["fit", "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())

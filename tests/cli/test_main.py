@@ -22,7 +22,7 @@ from tests.quick import OPTIONS
 from tests.scenes.noise_capture import lengthen_clip, rig
 
 
-def test_main__names_a_missing_capture(tmp_path: Path, run) -> None:
+def test_main__names_a_missing_capture(tmp_path, run):
     path = tmp_path / "nowhere"
     for args in (("info", path), ("fit", path, tmp_path / "out", *OPTIONS)):
         assert_refused(run(*args), "expected a capture folder", str(path))
@@ -30,7 +30,7 @@ def test_main__names_a_missing_capture(tmp_path: Path, run) -> None:
 
 
 @pytest.mark.slow
-def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
+def test_main__leaves_cameras_out(capture, tmp_path, run):
     lengthen_clip(capture)
     assert_refused(
         run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without."
@@ -62,7 +62,7 @@ def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
         (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
     ],
 )
-def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> None:
+def test_main__names_options_not_arguments(tmp_path, run, args, parts):
     out = tmp_path / "out"
     status, _, error = run(*(out if arg == "OUT" else arg for arg in args))
     assert status == 1
@@ -77,7 +77,7 @@ EXPORTS = ("ply", "gltf", "usd", "video", "web")
 @pytest.mark.parametrize(
     "command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]
 )
-def test_main__has_at_most_30_options_per_command(command: tuple[str, ...], capsys) -> None:
+def test_main__has_at_most_30_options_per_command(command, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main([*command, "--help"])
     assert stop.value.code == 0
@@ -91,7 +91,7 @@ def test_main__has_at_most_30_options_per_command(command: tuple[str, ...], caps
     assert not any("." in option for option in options)
 
 
-def test_main__runs_as_a_module() -> None:
+def test_main__runs_as_a_module():
     result = subprocess.run(
         [sys.executable, "-m", "morgs_mi", "fit"], capture_output=True, text=True, check=False
     )
@@ -115,9 +115,7 @@ def writing_commands(capture: Path, stream: Path, place: Path) -> list[tuple]:
 
 
 @pytest.mark.slow
-def test_main__writes_nothing_into_a_capture(
-    capture: Path, stream: Path, tmp_path: Path, run
-) -> None:
+def test_main__writes_nothing_into_a_capture(capture, stream, tmp_path, run):
     (capture / "capture.json").write_text('{"fps": 25}')
     place = tmp_path / "link"
     place.symlink_to(capture)
@@ -147,8 +145,8 @@ def test_main__writes_nothing_into_a_capture(
 
 @pytest.mark.slow
 def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, tmp_path, monkeypatch
+):
     command = [
         sys.executable,
         "-m",
@@ -168,9 +166,7 @@ def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
     assert (closed.returncode, closed.stderr) == (0, b"")
 
 
-def test_main__is_interrupted_while_the_variant_is_set(
-    capture: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_main__is_interrupted_while_the_variant_is_set(capture, run, monkeypatch):
     def interrupted(*_: object) -> None:
         try:
             raise KeyboardInterrupt
@@ -181,7 +177,7 @@ def test_main__is_interrupted_while_the_variant_is_set(
     assert run("info", capture) == (130, "", "Interrupted.\n")
 
 
-def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, monkeypatch) -> None:
+def test_main__reports_an_unexpected_error_in_one_sentence(capture, run, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise AttributeError("'NoneType' object has no attribute 'a'")
 
@@ -193,7 +189,7 @@ def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, m
     )
 
 
-def test_main__names_a_missing_empty_or_truncated_stream(stream: Path, tmp_path: Path, run) -> None:
+def test_main__names_a_missing_empty_or_truncated_stream(stream, tmp_path, run):
     assert_refused(
         run("render", tmp_path, "--camera", 0), "stream.morgs: expected a stream, found none"
     )
@@ -211,7 +207,7 @@ def test_main__names_a_missing_empty_or_truncated_stream(stream: Path, tmp_path:
         assert not output.exists()
 
 
-def test_main__prints_a_traceback_with_debug(tmp_path: Path, run) -> None:
+def test_main__prints_a_traceback_with_debug(tmp_path, run):
     status, _, error = run("info", tmp_path / "nothing", "--debug")
     assert status == 1
     assert "Traceback" in error
@@ -219,7 +215,7 @@ def test_main__prints_a_traceback_with_debug(tmp_path: Path, run) -> None:
 
 
 @pytest.mark.slow
-def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
+def test_main__goes_from_a_scene_to_an_evaluation(tmp_path, run):
     clip = tmp_path / "clip"
     out = tmp_path / "out"
     size = ("--width", 64, "--height", 48, "--spp", 4)

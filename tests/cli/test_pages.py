@@ -65,9 +65,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
-def test_commands__of_a_page_run_to_the_end(
-    page: str, recordings: Path, tmp_path: Path, run, monkeypatch
-) -> None:
+def test_commands__of_a_page_run_to_the_end(page, recordings, tmp_path, run, monkeypatch):
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")
     # Of `info --time`, which has no options.

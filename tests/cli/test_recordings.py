@@ -22,9 +22,7 @@ FRAMES = 3
     not CAPTURES, reason="needs recordings: set MORGS_MI_RECORDINGS to their folder"
 )
 @pytest.mark.parametrize("capture", CAPTURES, ids=lambda path: path.name)
-def test_recording__is_fitted_evaluated_and_exported_by_default(
-    capture: Path, tmp_path: Path, run
-) -> None:
+def test_recording__is_fitted_evaluated_and_exported_by_default(capture, tmp_path, run):
     out = tmp_path / "out"
     for command in (
         ("info", capture),

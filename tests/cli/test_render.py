@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -33,14 +31,12 @@ from tests.scenes.noise_capture import rig
         ),
     ],
 )
-def test_render__rejects_bad_input_in_one_sentence(
-    stream: Path, tmp_path: Path, run, args, parts
-) -> None:
+def test_render__rejects_bad_input_in_one_sentence(stream, tmp_path, run, args, parts):
     assert_refused(run("render", stream, *args), *parts)
     assert list(tmp_path.iterdir()) == [stream]
 
 
-def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> None:
+def test_render__draws_a_stream_without_gaussians_black(tmp_path, run):
     empty = Gaussians(*(np.zeros((0, *tail)) for tail in ((3,), (3,), (4,), (), (1, 3))))
     with StreamWriter(tmp_path / "s.morgs", rig(), 25) as writer:
         writer.write(keyframe_packet(empty, 0))
@@ -49,7 +45,7 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> 
 
 
 @pytest.mark.slow
-def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, run) -> None:
+def test_render__inserts_a_scene_into_some_frames(stream, tmp_path, run):
     (tmp_path / "ball.py").write_text(
         'def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n'
     )
@@ -60,9 +56,7 @@ def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "exr"])
-def test_render__removes_its_output_on_a_full_disk(
-    stream: Path, tmp_path: Path, run, name: str
-) -> None:
+def test_render__removes_its_output_on_a_full_disk(stream, tmp_path, run, name):
     # Compiled kernels are cached on disk too.
     run("render", stream, tmp_path / f"warm-{name}", "--camera", 0)
     with files_end_at(200):
@@ -72,9 +66,7 @@ def test_render__removes_its_output_on_a_full_disk(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["good.morgs", f"warm-{name}"]
 
 
-def test_render__removes_its_output_when_interrupted(
-    stream: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_render__removes_its_output_when_interrupted(stream, tmp_path, run, monkeypatch):
     monkeypatch.setattr("morgs_mi.playback.player.rasterize", interrupt)
     status, _, error = run("render", stream, "--camera", 0)
     assert status == 130
@@ -82,7 +74,7 @@ def test_render__removes_its_output_when_interrupted(
     assert list(tmp_path.iterdir()) == [stream]
 
 
-def test_render__skips_damaged_frames_when_asked(tmp_path: Path, run, caplog) -> None:
+def test_render__skips_damaged_frames_when_asked(tmp_path, run, caplog):
     path = tmp_path / "stream.morgs"
     write_stream(path, 6, keyframe_interval=3)
     _, _, offset = next(entry for entry in StreamReader(path).index() if entry[1] == 1)
@@ -101,9 +93,7 @@ def test_render__skips_damaged_frames_when_asked(tmp_path: Path, run, caplog) ->
     assert caplog.messages == [f"{path}: the damaged frames 1 to 2 are skipped."]
 
 
-def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(
-    stream: Path, tmp_path: Path, run, caplog
-) -> None:
+def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(stream, tmp_path, run, caplog):
     stream.write_bytes(stream.read_bytes()[: StreamReader(stream).index()[1][2] + 30])
     assert (
         run("render", stream, tmp_path / "png", "--camera", 0, "--width", 32, "--skip-damaged")[0]

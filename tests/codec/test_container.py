@@ -66,7 +66,7 @@ def assert_equal(got: Packet, expected: Packet) -> None:
         np.testing.assert_array_equal(got.arrays[name], array)
 
 
-def test_stream_reader__round_trips_header_and_packets(tmp_path: Path) -> None:
+def test_stream_reader__round_trips_header_and_packets(tmp_path):
     write(tmp_path / "s")
     stream = StreamReader(tmp_path / "s")
     assert stream.fps == 29.97
@@ -85,7 +85,7 @@ def test_stream_reader__round_trips_header_and_packets(tmp_path: Path) -> None:
             assert_equal(got, expected)
 
 
-def test_packet__is_encoded_once_and_does_not_change() -> None:
+def test_packet__is_encoded_once_and_does_not_change():
     array = np.arange(3, dtype=np.uint32)
     packet = Packet(PacketKind.RESIDUAL, 1, {"a": array})
     encoded = packet.encoded
@@ -99,7 +99,7 @@ def test_packet__is_encoded_once_and_does_not_change() -> None:
         packet.arrays["a"] = array  # pyright: ignore[reportIndexIssue]
 
 
-def test_decode_packet__restores_arrays_of_any_memory_order() -> None:
+def test_decode_packet__restores_arrays_of_any_memory_order():
     array = RNG.normal(size=(3, 5)).astype(np.float32)
     arrays = {
         "fortran": np.asfortranarray(array),
@@ -112,7 +112,7 @@ def test_decode_packet__restores_arrays_of_any_memory_order() -> None:
         assert not got[name].flags.writeable
 
 
-def test_stream_reader__reads_a_growing_file_up_to_its_last_complete_packet(tmp_path: Path) -> None:
+def test_stream_reader__reads_a_growing_file_up_to_its_last_complete_packet(tmp_path):
     with StreamWriter(tmp_path / "s", cameras(), 30) as writer:
         reader = StreamReader(tmp_path / "s")
         for i, packet in enumerate(PACKETS):
@@ -121,7 +121,7 @@ def test_stream_reader__reads_a_growing_file_up_to_its_last_complete_packet(tmp_
         assert len(list(reader)) == len(PACKETS)
 
 
-def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path: Path) -> None:
+def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path):
     path = tmp_path / "s"
     ends = write(path)
     whole = path.read_bytes()
@@ -139,7 +139,7 @@ def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path: Path)
         assert len(got) == max(intact - 1, 0)
 
 
-def test_stream_reader__detects_every_flipped_bit(tmp_path: Path) -> None:
+def test_stream_reader__detects_every_flipped_bit(tmp_path):
     path = tmp_path / "s"
     write(path)
     whole = path.read_bytes()
@@ -188,7 +188,7 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_decode_packet__refuses_inconsistent_packets(data: bytes, message: str) -> None:
+def test_decode_packet__refuses_inconsistent_packets(data, message):
     with pytest.raises(ValueError, match=message):
         decode_packet(data)
 
@@ -205,8 +205,8 @@ def test_decode_packet__refuses_inconsistent_packets(data: bytes, message: str) 
     ],
 )
 def test_stream_writer__refuses_invalid_packets_and_writes_nothing_of_them(
-    tmp_path: Path, packet: Packet, message: str
-) -> None:
+    tmp_path, packet, message
+):
     with StreamWriter(tmp_path / "s", cameras(), 30) as stream:
         with pytest.raises(ValueError, match=message):
             stream.write(packet)
@@ -214,7 +214,7 @@ def test_stream_writer__refuses_invalid_packets_and_writes_nothing_of_them(
     assert len(list(StreamReader(tmp_path / "s"))) == 1
 
 
-def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> None:
+def test_stream_reader__refuses_files_that_are_not_streams(tmp_path):
     path = tmp_path / "s"
     path.write_bytes(b"ply\nformat ascii")
     with pytest.raises(
@@ -246,8 +246,8 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
     ids=["kind", "inside the header", "large", "descending"],
 )
 def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausible(
-    tmp_path: Path, entries: list[tuple[int, int, int]]
-) -> None:
+    tmp_path, entries
+):
     ends = write(tmp_path / "s")
     packed = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
     data = (tmp_path / "s").read_bytes()[: ends[-1]]
@@ -259,9 +259,7 @@ def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausib
 
 
 @pytest.mark.parametrize("length", [0, 15, 40])
-def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(
-    tmp_path: Path, length: int
-) -> None:
+def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(tmp_path, length):
     path = tmp_path / "s"
     write(path)
     reader = StreamReader(path)
@@ -274,9 +272,7 @@ def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(
             call()
 
 
-def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(
-    tmp_path: Path,
-) -> None:
+def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(tmp_path):
     path = tmp_path / "s"
     # A limit on the file size makes a write fail in its middle, as a full disk does.
     program = f"""

@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,13 +44,13 @@ def fuzz(seconds: float, *names: str) -> None:
     assert all(counts[name]["streams"] > 0 for name in names)
 
 
-def test_readers__survive_damaged_and_forged_streams() -> None:
+def test_readers__survive_damaged_and_forged_streams():
     fuzz(0.3, *FUZZERS)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", FUZZERS)
-def test_readers__survive_minutes_of_damaged_and_forged_streams(name: str) -> None:
+def test_readers__survive_minutes_of_damaged_and_forged_streams(name):
     fuzz(FUZZ_SECONDS, name)
 
 
@@ -64,7 +63,7 @@ def flipped(clip: Clip, *frames: int, kind: int = 2) -> bytes:
     return bytes(data)
 
 
-def test_stream_reader__names_packet_byte_and_frame_of_damage(clip: Clip, tmp_path: Path) -> None:
+def test_stream_reader__names_packet_byte_and_frame_of_damage(clip, tmp_path):
     (tmp_path / "s").write_bytes(flipped(clip, 2))
     place = f"s: packet 3 at byte {clip.pieces[4].start}: its CRC should be "
     with pytest.raises(
@@ -87,8 +86,8 @@ def test_stream_reader__names_packet_byte_and_frame_of_damage(clip: Clip, tmp_pa
     ],
 )
 def test_stream_reader__continues_at_the_next_intact_keyframe(
-    clip: Clip, tmp_path: Path, frames: tuple[int, ...], kind: int, skipped: list[int]
-) -> None:
+    clip, tmp_path, frames, kind, skipped
+):
     (tmp_path / "s").write_bytes(flipped(clip, *frames, kind=kind))
     stream = StreamReader(tmp_path / "s", skip_damaged=True)
     assert stream.skipped == skipped
@@ -100,9 +99,7 @@ def test_stream_reader__continues_at_the_next_intact_keyframe(
         assert not differs(stream.seek(state.frame), clip)
 
 
-def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(
-    clip: Clip, tmp_path: Path
-) -> None:
+def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(clip, tmp_path):
     damaged = clip.pieces[4]
     data = bytearray(clip.data)
     data[damaged.start + 8] ^= 1  # the lowest byte of its length
@@ -121,14 +118,12 @@ def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(
     "read",
     [lambda data: StreamReader(data, skip_damaged=True), lambda data: StreamReader(data).near(1)],
 )
-def test_stream_reader__skips_no_damage_and_does_not_seek_in_a_pipe(clip: Clip, read) -> None:
+def test_stream_reader__skips_no_damage_and_does_not_seek_in_a_pipe(clip, read):
     with pytest.raises(ValueError, match="expected a file, got a pipe; save it first"):
         next(iter(read(io.BytesIO(clip.data))))
 
 
-def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(
-    clip: Clip, tmp_path: Path
-) -> None:
+def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip, tmp_path):
     for data in forged_streams(clip):
         (tmp_path / "s").write_bytes(data)
         stream = StreamReader(tmp_path / "s")
@@ -146,7 +141,7 @@ def constant(N: int, degree: int) -> CodedFrame:
 
 
 @pytest.mark.slow
-def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> None:
+def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need():
     free = 2**22 // 67
     assert len(reemitted_keyframe(constant(free, 3)).arrays["code"]) == -(-free // 16)
     packet = reemitted_keyframe(constant(free + 1, 3))
@@ -157,7 +152,7 @@ def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> 
     assert len(decode(None, packet)) == free + 1
 
 
-def test_decode__refuses_a_count_before_it_allocates(tmp_path: Path) -> None:
+def test_decode__refuses_a_count_before_it_allocates(tmp_path):
     """A keyframe of 1 MB could request 4 million Gaussians of 67 integers."""
     code = np.zeros(2**18, np.uint32)
     packet = Packet(

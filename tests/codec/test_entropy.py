@@ -30,14 +30,14 @@ def coded(*columns: np.ndarray) -> np.ndarray:
     return writer.words()
 
 
-def test_column_reader__inverts_the_writer_in_order() -> None:
+def test_column_reader__inverts_the_writer_in_order():
     reader = ColumnReader(coded(*COLUMNS.values()))
     for name, column in COLUMNS.items():
         np.testing.assert_array_equal(reader.take(len(column)), column, name)
 
 
 @pytest.mark.parametrize("scale", [0.3, 40])
-def test_column_writer__is_close_to_the_entropy(scale: float) -> None:
+def test_column_writer__is_close_to_the_entropy(scale):
     values = np.rint(np.random.default_rng(0).laplace(0, scale, 10_000)).astype(int)
     _, counts = np.unique(values, return_counts=True)
     entropy = -(counts * np.log2(counts / counts.sum())).sum()
@@ -48,11 +48,11 @@ def test_column_writer__is_close_to_the_entropy(scale: float) -> None:
     assert size == pytest.approx(column_bits(values), rel=0.02, abs=100)
 
 
-def test_column_writer__stores_a_constant_column_in_a_few_bytes() -> None:
+def test_column_writer__stores_a_constant_column_in_a_few_bytes():
     assert coded(np.zeros(100_000, np.int64)).nbytes < 40
 
 
-def test_column_reader__returns_wrong_numbers_or_raises_on_damage() -> None:
+def test_column_reader__returns_wrong_numbers_or_raises_on_damage():
     words = coded(*COLUMNS.values())
     for _ in range(100):
         damaged = words.copy()

@@ -50,7 +50,7 @@ def with_entry(path: str, text: str) -> bytes:
     ],
     ids=lambda value: value[:20],
 )
-def test_header_fields__refuse_other_types_and_ranges(path: str, text: str, message: str) -> None:
+def test_header_fields__refuse_other_types_and_ranges(path, text, message):
     with pytest.raises(ValueError, match=message):
         header_fields(with_entry(path, text))
 
@@ -73,9 +73,7 @@ def test_header_fields__refuse_other_types_and_ranges(path: str, text: str, mess
         ("viewmat.2.1", "[1]", ": `matrix` must be an array of real numbers"),
     ],
 )
-def test_header_fields__refuse_other_types_and_ranges_of_a_camera(
-    path: str, text: str, message: str
-) -> None:
+def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path, text, message):
     with pytest.raises(ValueError, match=re.escape(f"cameras[0]{message}")):
         header_fields(with_entry(f"cameras.0.{path}", text))
 
@@ -88,12 +86,12 @@ def test_header_fields__refuse_other_types_and_ranges_of_a_camera(
         (b"[1]", "`cameras` must be a list of at least one camera"),
     ],
 )
-def test_header_fields__refuse_other_json(data: bytes, message: str) -> None:
+def test_header_fields__refuse_other_json(data, message):
     with pytest.raises(ValueError, match=message):
         header_fields(data)
 
 
-def test_load_json__accepts_what_is_within_its_limits() -> None:
+def test_load_json__accepts_what_is_within_its_limits():
     deep = b"[" * 32 + b"]" * 32
     assert load_json(deep, len(deep)) == json.loads(deep)
     assert load_json(b"[18446744073709551615, -9223372036854775808, 1e308]", 99) == [
@@ -103,7 +101,7 @@ def test_load_json__accepts_what_is_within_its_limits() -> None:
     ]
 
 
-def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(tmp_path) -> None:
+def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(tmp_path):
     large = Camera(CAMERAS[0].K, CAMERAS[0].viewmat, 2**14, 2**14)
     message = r"a reader would refuse .* `cameras\[0\]` must have .* at most 2\^26 pixels"
     with pytest.raises(ValueError, match=message):

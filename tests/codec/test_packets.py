@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +24,7 @@ from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, jittered, writ
 
 
 @pytest.mark.parametrize("config", [None, CodecConfig(offset=True)], ids=["", "offset"])
-def test_decode__equals_a_decoder_from_the_specification(
-    tmp_path: Path, config: CodecConfig | None
-) -> None:
+def test_decode__equals_a_decoder_from_the_specification(tmp_path, config):
     packets, states = encoded_clip(6, config)
     write(tmp_path / "s", packets, states, every=3)
     plain = list(plain_decoder.states((tmp_path / "s").read_bytes()))
@@ -40,14 +37,14 @@ def test_decode__equals_a_decoder_from_the_specification(
             assert np.array_equal(value, expected[name]), name
 
 
-def test_residual_packet__of_a_static_frame_is_nearly_empty() -> None:
+def test_residual_packet__of_a_static_frame_is_nearly_empty():
     state = decode(None, keyframe_packet(cloud(5000), 0, CAMERAS))
     packet = residual_packet(state, state.gaussians)
     assert len(packet.encoded) < 200
     np.testing.assert_array_equal(decode(state, packet).grid.values, state.grid.values)
 
 
-def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing_else() -> None:
+def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing_else():
     plain, plain_states = encoded_clip(4)
     packets, states = encoded_clip(4, CodecConfig(offset=True))
     assert [state.gaussians.offset is None for state in states] == [True, False, False, False]
@@ -74,7 +71,7 @@ def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing
     assert not values["offset"][~mask].any()
 
 
-def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
+def test_residual_packet__of_a_decoded_state_reproduces_it():
     """Encoding a stream again, with the same steps, loses nothing more."""
     _, states = encoded_clip(5)
     for old, new in pairwise(states):
@@ -86,7 +83,7 @@ def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
         assert np.array_equal(result.grid.values, new.grid.values[survivors])
 
 
-def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
+def test_decode__ids_follow_a_gaussian_from_birth_to_death():
     first = cloud(6)
     state = decode(None, keyframe_packet(first, 0, CAMERAS))
     marked = Gaussians.concatenate([state.gaussians.select(np.array([0, 2, 5])), single_at(7.0)])
@@ -108,9 +105,7 @@ def single_at(x: float) -> Gaussians:
 
 
 @pytest.mark.parametrize(("degree", "confidence"), [(0, False), (3, True)])
-def test_decode__round_trips_every_degree_with_and_without_confidence(
-    degree: int, confidence: bool
-) -> None:
+def test_decode__round_trips_every_degree_with_and_without_confidence(degree, confidence):
     state = decode(None, keyframe_packet(cloud(20, degree, confidence), 3, CAMERAS))
     target = jittered(state.gaussians, np.random.default_rng(0))
     result = decode(state, residual_packet(state, target, None, CAMERAS))
@@ -120,7 +115,7 @@ def test_decode__round_trips_every_degree_with_and_without_confidence(
     assert_close(result.gaussians.numpy()["sh_coeffs"], target.numpy()["sh_coeffs"], atol=0.02)
 
 
-def test_residual_packet__removes_all_gaussians() -> None:
+def test_residual_packet__removes_all_gaussians():
     state = decode(None, keyframe_packet(cloud(5), 0, CAMERAS))
     new_state = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
     assert (new_state.ids.tolist(), new_state.next_id) == ([5], 6)
@@ -173,14 +168,14 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
         ),
     ],
 )
-def test_decode__refuses_packets_that_contradict_themselves(change, message: str) -> None:
+def test_decode__refuses_packets_that_contradict_themselves(change, message):
     packets, states = encoded_clip(2)
     packet = change(*packets)
     with pytest.raises(ValueError, match=message):
         decode(states[0] if packet.kind == PacketKind.RESIDUAL else None, packet)
 
 
-def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
+def test_decode__refuses_scrambled_code_or_the_packet_after_it():
     packets, states = encoded_clip(3)
     rng = np.random.default_rng(0)
     for _ in range(60):
@@ -191,7 +186,7 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
             decode(decode(states[0], damaged), packets[2])
 
 
-def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
+def test_lasting_ids__continue_after_those_of_the_set_before():
     """A re-emitted keyframe repeats a set; a keyframe of the next frame starts another one with ids
     from 0.
     """
@@ -207,6 +202,6 @@ def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
     assert ids == [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [3, 4])]
 
 
-def test_keyframe_packet__refuses_numbers_that_are_not_finite() -> None:
+def test_keyframe_packet__refuses_numbers_that_are_not_finite():
     with pytest.raises(ValueError, match="`means` must be finite"):
         keyframe_packet(replace(cloud(3), means=np.full((3, 3), np.nan)), 0)

@@ -21,7 +21,7 @@ from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jittered
 
 
-def test_residual_packet__errors_stay_within_the_tolerance() -> None:
+def test_residual_packet__errors_stay_within_the_tolerance():
     """The error is at most half a step for a new Gaussian, a step for a moved one, half a step for
     its base colour.
     """
@@ -56,7 +56,7 @@ def test_residual_packet__errors_stay_within_the_tolerance() -> None:
         assert opacity.max() > 0.7 * error * BY_NAME["logit_opacities"].error, "the bound is near"
 
 
-def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() -> None:
+def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors():
     gaussians = cloud(400)
     changed_gaussians = jittered(gaussians, np.random.default_rng(1))
     sizes = []
@@ -79,9 +79,7 @@ def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() ->
 
 
 @pytest.mark.parametrize(("target", "offset"), [(2000, False), (8000, False), (8000, True)])
-def test_residual_packet__stays_below_its_target_size_and_comes_near_it(
-    target: int, offset: bool
-) -> None:
+def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target, offset):
     """Offsets count towards it."""
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     rng = np.random.default_rng(1)
@@ -97,7 +95,7 @@ def test_residual_packet__stays_below_its_target_size_and_comes_near_it(
     assert len(decode(state, packet)) == 1500
 
 
-def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step() -> None:
+def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step():
     config = CodecConfig(birth_precision=1)
     state = decode(None, keyframe_packet(cloud(), 0, CAMERAS, config))
     raw = {name: value.astype(np.float64) for name, value in state.gaussians.numpy().items()}
@@ -110,7 +108,7 @@ def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step() 
     assert np.flatnonzero(result.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
 
 
-def test_grid__stores_the_attribute_of_a_new_row_of_the_table() -> None:
+def test_grid__stores_the_attribute_of_a_new_row_of_the_table():
     """One more row with an `error` and a field of that name; streams without the attribute stay the
     same.
     """
@@ -120,7 +118,7 @@ def test_grid__stores_the_attribute_of_a_new_row_of_the_table() -> None:
     assert result.stdout.strip() == history(encoded_clip(4)[1])
 
 
-def test_residual_packet__follows_a_turn_of_any_angle() -> None:
+def test_residual_packet__follows_a_turn_of_any_angle():
     """The component that is not stored was the largest at birth; later it may vanish."""
     angles = np.linspace(0, 2 * np.pi, 40)
     one_axis = cloud(1)
@@ -132,7 +130,7 @@ def test_residual_packet__follows_a_turn_of_any_angle() -> None:
         assert abs(state.gaussians.numpy()["quats"][0] @ q) > np.cos(np.deg2rad(2))
 
 
-def test_keyframe_packet__codes_extremes_as_exactly_as_float32() -> None:
+def test_keyframe_packet__codes_extremes_as_exactly_as_float32():
     """Close to a lens steps are tiny, and large, distant or bright Gaussians would need unbounded
     integers.
     """

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import threading
-from pathlib import Path
 from typing import BinaryIO
 
 import pytest
@@ -21,7 +20,7 @@ from morgs_mi.codec.reader import StreamReader
 from tests.scenes.coded_clip import CAMERAS, assert_same, encoded_clip, history, write
 
 
-def test_seek__equals_playing_with_and_without_an_index(tmp_path: Path) -> None:
+def test_seek__equals_playing_with_and_without_an_index(tmp_path):
     packets, states = encoded_clip(14)
     path = tmp_path / "s"
     write(path, packets, states)
@@ -48,7 +47,7 @@ def tcp() -> tuple[BinaryIO, BinaryIO]:
         return receiver.makefile("rb"), sender.makefile("wb", buffering=0)
 
 
-def test_stream_reader__receives_frames_while_they_are_written() -> None:
+def test_stream_reader__receives_frames_while_they_are_written():
     packets, states = encoded_clip(5)
     source, sink = tcp()
     got: list[CodedFrame] = []
@@ -73,7 +72,7 @@ def test_stream_reader__receives_frames_while_they_are_written() -> None:
         assert_same(received_state, state)
 
 
-def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> None:
+def test_stream_reader__reports_a_lost_connection_after_complete_frames():
     packets, states = encoded_clip(3)
     source, sink = tcp()
     with sink:
@@ -95,9 +94,7 @@ def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [60, pytest.param(300, marks=pytest.mark.long)])
-def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(
-    tmp_path: Path, frames: int
-) -> None:
+def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path, frames):
     packets, states = encoded_clip(frames, degree=0)
     write(tmp_path / "s", packets, states, every=50)
     program = f"""
@@ -129,8 +126,8 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
     ],
 )
 def test_coded_frames__name_file_packet_and_byte_of_frames_out_of_order(
-    tmp_path: Path, order: list[int], place: int, message: str
-) -> None:
+    tmp_path, order, place, message
+):
     packets, states = encoded_clip(4)
     chosen = [packets[k] for k in order]
     write(tmp_path / "s", chosen, [states[k] for k in order], every=9)

@@ -179,9 +179,7 @@ CASES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "content", "message"), CASES.values(), ids=CASES)
-def test_readers__refuse_a_hostile_file_in_one_sentence(
-    tmp_path: Path, read, content, message: str
-) -> None:
+def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path, read, content, message):
     path = tmp_path / ("0.ply" if read is read_splats else "0.png")
     content(path) if callable(content) else path.write_bytes(content)
     with pytest.raises((ValueError, OSError), match=message) as caught:
@@ -190,7 +188,7 @@ def test_readers__refuse_a_hostile_file_in_one_sentence(
 
 
 @pytest.mark.parametrize("read", [read_array, read_json])
-def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
+def test_readers__refuse_pipes_and_folders(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path):
         with pytest.raises(
@@ -200,9 +198,7 @@ def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-def test_readers__read_utf_8_with_and_without_a_byte_order_mark(
-    tmp_path: Path, encoding: str
-) -> None:
+def test_readers__read_utf_8_with_and_without_a_byte_order_mark(tmp_path, encoding):
     (tmp_path / "a").write_bytes('a = "é"\r\n[b]\r\n'.encode(encoding))
     assert read_toml(tmp_path / "a") == {"a": "é", "b": {}}
     (tmp_path / "a").write_bytes('{"a":\r\n"é"}'.encode(encoding))
@@ -210,7 +206,7 @@ def test_readers__read_utf_8_with_and_without_a_byte_order_mark(
 
 
 @pytest.mark.parametrize("order", "CF")
-def test_read_array__inverts_save(tmp_path: Path, order) -> None:
+def test_read_array__inverts_save(tmp_path, order):
     array = np.asarray(np.arange(6.0).reshape(2, 3), order=order)
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", data=array, scalar=np.int64(3))
@@ -219,7 +215,7 @@ def test_read_array__inverts_save(tmp_path: Path, order) -> None:
     assert read_array(tmp_path / "a.npz", "scalar") == 3
 
 
-def test_array_names__lists_an_archive_or_names_a_broken_one(tmp_path: Path) -> None:
+def test_array_names__lists_an_archive_or_names_a_broken_one(tmp_path):
     np.savez(tmp_path / "a.npz", data=np.zeros(2), scalar=np.int64(3))
     assert array_names(tmp_path / "a.npz") == ["data", "scalar"]
     (tmp_path / "a.npz").write_bytes(b"PK")
@@ -227,7 +223,7 @@ def test_array_names__lists_an_archive_or_names_a_broken_one(tmp_path: Path) -> 
         array_names(tmp_path / "a.npz")
 
 
-def test_readers__accept_images_of_one_colour(tmp_path: Path) -> None:
+def test_readers__accept_images_of_one_colour(tmp_path):
     """They take many times the size of their files, which is not a claim."""
     write_exr(tmp_path / "a.exr", {"a": np.zeros((1000, 1500))})
     assert read_exr(tmp_path / "a.exr")["a"].shape == (1000, 1500)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tomllib
 from dataclasses import asdict, field
 from math import nan
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -103,20 +102,20 @@ class Config:
         Root(Branch(Leaf(pair=(0.25, -0.0), count=2**63, name="none"), weight=-1.0), seed=4),
     ],
 )
-def test_config_toml__is_read_back_as_the_same_config(config: Any, tmp_path: Path) -> None:
+def test_config_toml__is_read_back_as_the_same_config(config, tmp_path):
     (tmp_path / "a.toml").write_text(config_toml(config), encoding="utf-8")
     values = read_config(tmp_path / "a.toml")
     assert apply_values(type(config)(), values, "a.toml") == config
 
 
-def test_config_toml__restores_a_config_over_other_values(tmp_path: Path) -> None:
+def test_config_toml__restores_a_config_over_other_values(tmp_path):
     (tmp_path / "a.toml").write_text(config_toml(Leaf(limit=None)))
     assert apply_values(
         Leaf(limit=2.0, count=9, sizes=(7,)), read_config(tmp_path / "a.toml")
     ) == Leaf(limit=None)
 
 
-def test_config_toml__has_every_setting_with_its_docstring() -> None:
+def test_config_toml__has_every_setting_with_its_docstring():
     text = config_toml(StreamConfig())
     tables = tomllib.loads(text)
 
@@ -135,7 +134,7 @@ def test_config_toml__has_every_setting_with_its_docstring() -> None:
     assert "# Name of the leaf.\n" in config_toml(Leaf())
 
 
-def test_apply_values__replaces_only_what_is_named() -> None:
+def test_apply_values__replaces_only_what_is_named():
     values = {"seed": 5, "fit": {"epochs": 2, "density": {"births": 1}}}
     config = apply_values(StreamConfig(fit=FitConfig(sh_degree=3)), values)
     density = DensityConfig(births=1.0)
@@ -178,9 +177,7 @@ def test_apply_values__replaces_only_what_is_named() -> None:
         ),
     ],
 )
-def test_apply_values__names_file_key_expected_and_given(
-    config: Any, text: str, message: str, tmp_path: Path
-) -> None:
+def test_apply_values__names_file_key_expected_and_given(config, text, message, tmp_path):
     path = tmp_path / "a.toml"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"a\.toml: ") as caught:
@@ -198,9 +195,7 @@ def test_apply_values__names_file_key_expected_and_given(
         (b"\xff", ValueError, r"expected text in UTF-8, got a broken file \('utf-8' codec"),
     ],
 )
-def test_read_config__names_a_file_that_cannot_be_read(
-    content, error, message, tmp_path: Path
-) -> None:
+def test_read_config__names_a_file_that_cannot_be_read(content, error, message, tmp_path):
     path = tmp_path / "a.toml"
     if content is not None:
         path.write_bytes(content)
@@ -223,7 +218,7 @@ def test_read_config__names_a_file_that_cannot_be_read(
         },
     ],
 )
-def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]):
+def test_check_ranges__accepts_values_within_their_ranges(values):
     Config(**values)
 
 
@@ -249,9 +244,7 @@ def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]
         ),
     ],
 )
-def test_check_ranges__names_the_field_its_range_and_the_value(
-    name: str, value: object, expected: str
-):
+def test_check_ranges__names_the_field_its_range_and_the_value(name, value, expected):
     with pytest.raises(ValueError, match=r"^Config\(\): ") as caught:
         Config(**{name: value})
     assert str(caught.value).startswith(f"Config(): `{name}` must be {expected}")

@@ -42,7 +42,7 @@ class Plant:
     """Number of roots."""
 
 
-def test_documented__lists_fields_with_defaults() -> None:
+def test_documented__lists_fields_with_defaults():
     expected = """A plant.
 
 Raises:
@@ -56,9 +56,7 @@ Fields:
     assert Plant.__doc__ == inspect.getdoc(Plant) == Plant().__doc__ == expected
 
 
-def test_page__is_a_path_in_the_checkout_and_else_an_address(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page__is_a_path_in_the_checkout_and_else_an_address(tmp_path, monkeypatch):
     assert page("flow") == "docs/flow.md"
     monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
     assert (
@@ -69,9 +67,7 @@ def test_page__is_a_path_in_the_checkout_and_else_an_address(
 
 
 @pytest.mark.slow
-def test_page__gives_every_page_that_a_message_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page__gives_every_page_that_a_message_names(tmp_path, monkeypatch):
     named = []
     for path in SOURCES:
         text = re.sub(r"\n\s*#[^\n]*", "", path.read_text(encoding="utf-8"))
@@ -84,7 +80,7 @@ def test_page__gives_every_page_that_a_message_names(
 
 
 @pytest.mark.slow
-def test_page__exists_for_every_call() -> None:
+def test_page__exists_for_every_call():
     text = "\n".join(path.read_text(encoding="utf-8") for path in SOURCES)
     names = set(re.findall(r"\bpage\(['\"]([\w/]+)", text))
     assert len(names) > 4

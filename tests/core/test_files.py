@@ -33,9 +33,7 @@ def write(partial: Path, kind: str, text: str = "new") -> None:
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("old", [False, True])
-def test_atomic_path__appears_at_the_end_and_replaces_the_old(
-    tmp_path: Path, kind: str, old: bool
-) -> None:
+def test_atomic_path__appears_at_the_end_and_replaces_the_old(tmp_path, kind, old):
     if old:
         write(tmp_path / "x", kind, "old")
     old_tree = tree(tmp_path)
@@ -55,9 +53,7 @@ def test_atomic_path__appears_at_the_end_and_replaces_the_old(
         ("folder", False, OSError(28, "No space left")),
     ],
 )
-def test_atomic_path__is_unchanged_after_an_error_in_the_body(
-    tmp_path: Path, kind: str, old: bool, error
-) -> None:
+def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path, kind, old, error):
     if old:
         write(tmp_path / "x", kind, "old")
     old_tree = tree(tmp_path)
@@ -73,7 +69,7 @@ def test_atomic_path__is_unchanged_after_an_error_in_the_body(
     assert tree(tmp_path) == old_tree
 
 
-def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path: Path) -> None:
+def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path):
     write_json(tmp_path / "x.json", {"a": 1})
     old_tree = tree(tmp_path)
     with files_end_at(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
@@ -82,7 +78,7 @@ def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", ["a file", "a folder", "missing"])
-def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case: str) -> None:
+def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path, case):
     folder = tmp_path / "folder"
     if case == "a file":
         folder.touch()
@@ -98,16 +94,14 @@ def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case
     assert tree(tmp_path) == old_tree
 
 
-def test_atomic_path__replaces_no_device_and_no_pipe(tmp_path: Path) -> None:
+def test_atomic_path__replaces_no_device_and_no_pipe(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(FileExistsError, match=r"test\(\): .*/pipe is a device or a pipe"):
         atomic_path(tmp_path / "pipe", "test()").__enter__()
     assert (tmp_path / "pipe").is_fifo()
 
 
-def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_atomic_path__restores_the_old_folder_after_a_failed_swap(tmp_path, monkeypatch):
     write(tmp_path / "x", "folder", "old")
     old_tree = tree(tmp_path)
 
@@ -123,7 +117,7 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
     assert tree(tmp_path) == old_tree
 
 
-def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path: Path) -> None:
+def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path):
     """Partial output of another name, or of a running process, may still be written and stays."""
     gone = subprocess.Popen(["true"])
     gone.wait()
@@ -137,16 +131,14 @@ def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path: Pat
     assert tree(tmp_path) == others | {"x": None, "x/b": b""}
 
 
-def test_write_json__follows_a_link(tmp_path: Path) -> None:
+def test_write_json__follows_a_link(tmp_path):
     (tmp_path / "link.json").symlink_to(tmp_path / "x.json")
     write_json(tmp_path / "link.json", {})
     assert (tmp_path / "link.json").is_symlink()
     assert (tmp_path / "x.json").read_text() == "{}\n"
 
 
-def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(
-    tmp_path: Path,
-) -> None:
+def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(tmp_path):
     write(tmp_path / "x", "folder", "old")
     with (
         pytest.raises(
@@ -160,7 +152,7 @@ def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(
     assert tree(tmp_path) == {"x": None, "x/a": b"old", "y": None, "y/a": b"theirs"}
 
 
-def test_write_json__writes_null_for_infinity_and_nan(tmp_path: Path) -> None:
+def test_write_json__writes_null_for_infinity_and_nan(tmp_path):
     write_json(
         tmp_path / "new" / "a.json", {"psnr": [float("inf"), 1.0], "deep": {"nan": float("nan")}}
     )
@@ -173,7 +165,7 @@ def test_write_json__writes_null_for_infinity_and_nan(tmp_path: Path) -> None:
         write_json(tmp_path / "file" / "b.json", {})
 
 
-def test_locked_folder__refuses_a_second_writer_until_the_first_has_ended(tmp_path: Path) -> None:
+def test_locked_folder__refuses_a_second_writer_until_the_first_has_ended(tmp_path):
     out = tmp_path / "new" / "out"
     (tmp_path / "link").symlink_to(out)
     with locked_folder(out, "test()"):
@@ -188,7 +180,7 @@ def test_locked_folder__refuses_a_second_writer_until_the_first_has_ended(tmp_pa
     assert tree(tmp_path / "new") == {"out": None, "out/a": b"whole"}
 
 
-def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path: Path) -> None:
+def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path):
     script = (
         "import os, sys; from morgs_mi.core.files import locked_folder\n"
         "with locked_folder(sys.argv[1], 'test()'): os.kill(os.getpid(), 9)\n"
@@ -202,7 +194,7 @@ def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path: Path) -> N
     assert not tree(tmp_path)
 
 
-def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path: Path) -> None:
+def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path):
     with locked_folder(tmp_path / "new" / "out", "test()"):
         pass
     assert not tree(tmp_path)
@@ -220,9 +212,7 @@ def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path: Pat
         ("/sys/out", r"^test\(\): cannot write into /sys/out: [^:\[]*; check"),
     ],
 )
-def test_locked_folder__reports_a_folder_that_cannot_be_written(
-    tmp_path: Path, folder: str, sentence: str
-) -> None:
+def test_locked_folder__reports_a_folder_that_cannot_be_written(tmp_path, folder, sentence):
     """/sys accepts no new files, even from root."""
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=sentence):

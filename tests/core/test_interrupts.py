@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 import weakref
-from collections.abc import Callable
 
 import pytest
 
@@ -39,11 +38,11 @@ def chained(kind: type[Exception], explicit: bool) -> BaseException:
         ExceptionGroup("tasks", [ValueError(), chained(RuntimeError, True)]),
     ],
 )
-def test_is_interruption__follows_causes_contexts_and_groups(error: BaseException) -> None:
+def test_is_interruption__follows_causes_contexts_and_groups(error):
     assert is_interruption(error)
 
 
-def test_is_interruption__is_false_for_other_errors_and_ends_in_a_cycle() -> None:
+def test_is_interruption__is_false_for_other_errors_and_ends_in_a_cycle():
     first = ValueError()
     second = OSError()
     first.__cause__ = second
@@ -55,7 +54,7 @@ class Thing:
     """An object that can be referred to weakly."""
 
 
-def test_interrupts_raised__releases_the_variables_of_what_was_interrupted() -> None:
+def test_interrupts_raised__releases_the_variables_of_what_was_interrupted():
     references: list[weakref.ref[Thing]] = []
 
     def interrupted() -> None:
@@ -71,7 +70,7 @@ def test_interrupts_raised__releases_the_variables_of_what_was_interrupted() -> 
     assert caught.value is not None
 
 
-def test_interrupts_raised__leaves_other_errors_as_they_are() -> None:
+def test_interrupts_raised__leaves_other_errors_as_they_are():
     error = ValueError("other")
     with pytest.raises(ValueError, match="other") as caught, interrupts_raised():
         raise error
@@ -94,9 +93,7 @@ def in_a_destructor() -> None:
 
 
 @pytest.mark.parametrize("interrupt", [plainly, in_a_destructor])
-def test_interruptible__raises_once_for_each_signal(
-    heeds_interrupts: None, interrupt: Callable[[], None]
-) -> None:
+def test_interruptible__raises_once_for_each_signal(heeds_interrupts, interrupt):
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 
     def wait() -> None:
@@ -111,12 +108,12 @@ def test_interruptible__raises_once_for_each_signal(
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
-def test_interruptible__raises_what_was_swallowed_at_the_end(heeds_interrupts: None) -> None:
+def test_interruptible__raises_what_was_swallowed_at_the_end(heeds_interrupts):
     with pytest.raises(KeyboardInterrupt), interruptible():
         in_a_destructor()
 
 
-def test_postponed__raises_at_its_end(heeds_interrupts: None) -> None:
+def test_postponed__raises_at_its_end(heeds_interrupts):
     stages = []
 
     def interrupted() -> None:
@@ -129,7 +126,7 @@ def test_postponed__raises_at_its_end(heeds_interrupts: None) -> None:
     assert stages == ["done"]
 
 
-def test_interruptible__lets_a_background_process_ignore_ctrl_c() -> None:
+def test_interruptible__lets_a_background_process_ignore_ctrl_c():
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with interruptible():
@@ -158,7 +155,7 @@ sys.exit(main())
 @pytest.mark.parametrize(
     ("module", "number"), [("numpy", "SIGINT"), ("drjit", "SIGTERM"), ("tyro", "SIGHUP")]
 )
-def test_begin_command__ends_quietly_while_libraries_are_imported(module: str, number: str) -> None:
+def test_begin_command__ends_quietly_while_libraries_are_imported(module, number):
     script = STARTING.format(module=module, number=number)
     result = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
@@ -167,7 +164,7 @@ def test_begin_command__ends_quietly_while_libraries_are_imported(module: str, n
 
 
 @pytest.mark.parametrize("closed", [0, 1, 2])
-def test_begin_command__replaces_a_closed_standard_stream(closed: int) -> None:
+def test_begin_command__replaces_a_closed_standard_stream(closed):
     """Otherwise the next file that is opened would be the standard stream of libraries."""
     script = (
         "import os, sys; sys.argv = ['morgs-mi']; import morgs_mi; sys.exit(os.fstat({0}).st_rdev "
@@ -178,7 +175,7 @@ def test_begin_command__replaces_a_closed_standard_stream(closed: int) -> None:
     assert subprocess.run(args, preexec_fn=lambda: os.close(closed), check=False).returncode == 0
 
 
-def test_begin_command__changes_nothing_in_other_programs() -> None:
+def test_begin_command__changes_nothing_in_other_programs():
     script = (
         "import signal; import morgs_mi; print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL)"
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ from tests.scenes.moving_splats import (
 from tests.scenes.tiny_network import squared_difference
 
 
-def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip: Path) -> None:
+def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip):
     result = evaluate_stream(fitted_clip)
     assert result.held_out
     assert list(result.views) == ["cam0"]
@@ -65,7 +64,7 @@ def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_c
     assert np.isnan(result.psnr_slope), "there is no line through infinite values"
 
 
-def test_evaluate_stream__names_frames_that_were_fitted_without_images(fitted_clip, capsys) -> None:
+def test_evaluate_stream__names_frames_that_were_fitted_without_images(fitted_clip, capsys):
     report = fitted_clip / "report.json"
     text = report.read_text()
     rows = json.loads(text)["frames"]
@@ -78,7 +77,7 @@ def test_evaluate_stream__names_frames_that_were_fitted_without_images(fitted_cl
     assert "frames 1 were fitted without any image" in capsys.readouterr().err
 
 
-def test_evaluate_stream__refuses_another_take_with_the_same_first_frame(fitted_clip) -> None:
+def test_evaluate_stream__refuses_another_take_with_the_same_first_frame(fitted_clip):
     report = fitted_clip / "report.json"
     text = report.read_text()
     frames = load_capture(fitted_clip / "capture").partial_frames()
@@ -98,9 +97,7 @@ def test_evaluate_stream__refuses_another_take_with_the_same_first_frame(fitted_
         report.write_text(text)
 
 
-def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(fitted_clip, tmp_path):
     write_stream(tmp_path / "s.morgs", {"test_view": None})
     with pytest.raises(FileNotFoundError, match="expected the path of its capture"):
         evaluate_stream(tmp_path / "s.morgs")
@@ -113,9 +110,7 @@ def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(
     assert result.frames[0].seconds is None
 
 
-def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(fitted_clip, tmp_path):
     """A keyframe has no motion error. The error of zero motion is the true motion."""
     state = decode(None, keyframe_packet(moved(1), 0, CAMERAS, EXACT))
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
@@ -130,8 +125,8 @@ def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(
 
 
 def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+    fitted_clip, tmp_path
+):
     """The first splat is removed and one with a wrong motion is added: the motion of the others is
     still exact.
     """
@@ -149,9 +144,7 @@ def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
 
 
 @pytest.mark.usefixtures("small_images")
-def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip, tmp_path):
     small = load_capture(fitted_clip / "capture", downscale=1.7)
     with StreamWriter(
         tmp_path / "s.morgs", small.cameras, 25, {"test_view": 0, "downscale": small.downscale}
@@ -161,9 +154,7 @@ def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(
     assert evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.psnr > 20
 
 
-def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(fitted_clip, tmp_path):
     bright = moved(0).sh_coeffs + 0.5 / SH_C0
     darker = replace(moved(0), sh_coeffs=0.9 * bright - 0.5 / SH_C0)
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
@@ -175,9 +166,7 @@ def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(
     )
 
 
-def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted_clip, tmp_path):
     """The clip's confidence of 0.5 is never above the threshold; a confidence of 1 is rendered as
     the alpha.
     """
@@ -190,9 +179,7 @@ def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(
     assert overlap > 0
 
 
-def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitted_clip, tmp_path):
     shutil.copytree(
         fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
     )
@@ -205,9 +192,7 @@ def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(
     assert np.isnan(result.scores.confidence_iou)
 
 
-def test_evaluate_stream__reports_lpips_if_a_network_is_given(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__reports_lpips_if_a_network_is_given(fitted_clip, tmp_path):
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     network = squared_difference(tmp_path / "net.onnx", HEIGHT, WIDTH)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture", lpips=Lpips(network))
@@ -221,9 +206,7 @@ def test_evaluate_stream__reports_lpips_if_a_network_is_given(
     assert np.isnan(result.scores.lpips_moving)
 
 
-def test_evaluation__as_dict_holds_scores_drift_and_bytes(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluation__as_dict_holds_scores_drift_and_bytes(fitted_clip, tmp_path):
     file = tmp_path / "s.morgs"
     write_stream(file, {"test_view": 0}, shift=1)
     result = evaluate_stream(file, fitted_clip / "capture")
@@ -244,9 +227,7 @@ def test_evaluation__as_dict_holds_scores_drift_and_bytes(
     assert rows[1]["views"]["cam0"]["psnr"] == result.frames[1].views["cam0"].psnr
 
 
-def test_evaluate_stream__refuses_a_stream_of_another_capture(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluate_stream__refuses_a_stream_of_another_capture(fitted_clip, tmp_path):
     write_colmap(tmp_path / "sparse", CAMERAS[:1])
     write_video(tmp_path / "cam0", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * FRAMES, 25)
     message = "expected the recording that .* was fitted to, got the cameras"
@@ -259,7 +240,7 @@ def test_evaluate_stream__refuses_a_stream_of_another_capture(
             writer.write(keyframe_packet(moved(0), FRAMES))
 
 
-def test_evaluate_stream__compares_the_light_of_an_hdr_recording(tmp_path: Path) -> None:
+def test_evaluate_stream__compares_the_light_of_an_hdr_recording(tmp_path):
     write_colmap(tmp_path / "capture" / "sparse", CAMERAS)
     for camera in CAMERAS:
         (tmp_path / "capture" / camera.name).mkdir()

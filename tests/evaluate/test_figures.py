@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from tests.scenes.moving_splats import FRAMES, HEIGHT, PIXELS, WIDTH, write_stre
 LEGEND = 96
 
 
-def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> None:
+def test_draw_stream__writes_every_figure(fitted_clip, tmp_path):
     done = []
     paths = draw_stream(fitted_clip, tmp_path / "new", progress=lambda *count: done.append(count))
     assert [path.name for path in paths] == ["slice.png", "motion.png", "confidence.png"]
@@ -41,9 +40,7 @@ def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> 
     assert_close(picture, true, atol=2)
 
 
-def test_draw_stream__draws_the_stream_alone_without_truth(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_draw_stream__draws_the_stream_alone_without_truth(fitted_clip, tmp_path):
     shutil.copytree(
         fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
     )
@@ -54,9 +51,7 @@ def test_draw_stream__draws_the_stream_alone_without_truth(
         assert motion_scale(capture, capture.cameras[0]) == pytest.approx(scale)
 
 
-def test_draw_stream__draws_offsets_beside_the_whole_motion(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_draw_stream__draws_offsets_beside_the_whole_motion(fitted_clip, tmp_path):
     write_stream(tmp_path / "s.morgs", open_stream(fitted_clip).metadata, offset=0.05)
     path = draw_stream(tmp_path / "s.morgs", tmp_path)[-1]
     assert path.name == "offset.png"

@@ -28,7 +28,7 @@ def text_of(result: Evaluation) -> str:
     return "\n".join(line.rstrip() for line in console.export_text().splitlines())
 
 
-def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
+def test_evaluation_tables__fit_eighty_columns(result):
     lines = text_of(result).splitlines()
     assert max(map(len, lines)) <= 80
     rows = {line.split("  ")[0].strip(): line.split()[-3:] for line in lines}
@@ -44,9 +44,7 @@ def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
     assert any(line.endswith(figure(result.variation.input, 3)) for line in lines)
 
 
-def test_evaluation_tables__have_a_row_for_each_of_several_views(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_evaluation_tables__have_a_row_for_each_of_several_views(fitted_clip, tmp_path):
     write_stream(tmp_path / "s.morgs", {"test_view": None}, shift=1)
     several = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     lines = text_of(several).splitlines()
@@ -62,7 +60,7 @@ def test_evaluation_tables__have_a_row_for_each_of_several_views(
         assert rows[name] == [figure(*value) for value in expected]
 
 
-def test_evaluation_summary__holds_the_figures_that_no_table_has(result: Evaluation) -> None:
+def test_evaluation_summary__holds_the_figures_that_no_table_has(result):
     text = " ".join(evaluation_summary(result))
     motion = result.motion_3d
     assert motion is not None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -24,8 +22,8 @@ from morgs_mi.io.video import open_clips
     ],
 )
 def test_open_clips__scales_the_bits_of_cameras_or_names_dark_images(
-    tmp_path: Path, caplog, most: list[int], shown: list[int], note: str
-) -> None:
+    tmp_path, caplog, most, shown, note
+):
     for camera, value in enumerate(most):
         (tmp_path / str(camera)).mkdir()
         image = np.full((32, 48, 3), value, np.uint16)
@@ -36,7 +34,7 @@ def test_open_clips__scales_the_bits_of_cameras_or_names_dark_images(
     assert bool(note) == bool(caplog.text)
 
 
-def test_open_clips__refuses_later_values_above_the_bits_of_cameras(tmp_path: Path) -> None:
+def test_open_clips__refuses_later_values_above_the_bits_of_cameras(tmp_path):
     for frame, value in enumerate((4095, 5000)):
         image = np.full((32, 48), value, np.uint16)
         cv2.imwrite(str(tmp_path / f"{frame}.png"), image)
@@ -46,7 +44,7 @@ def test_open_clips__refuses_later_values_above_the_bits_of_cameras(tmp_path: Pa
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int32])
-def test_open_clips__refuses_images_that_have_neither_8_nor_16_bits(tmp_path: Path, dtype) -> None:
+def test_open_clips__refuses_images_that_have_neither_8_nor_16_bits(tmp_path, dtype):
     cv2.imwrite(str(tmp_path / "0.tif"), np.full((32, 48, 3), 9, dtype))
     with pytest.raises(ValueError, match=r"0\.tif: expected 8 or 16 bits"):
         open_clips([tmp_path])

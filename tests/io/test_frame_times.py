@@ -43,7 +43,7 @@ def number(image: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize("name", ["hevc.mp4", "hevc.mov", "h264.mp4"])
-def test_video_reader__has_the_shown_frames_of_hevc_with_sound(name: str) -> None:
+def test_video_reader__has_the_shown_frames_of_hevc_with_sound(name):
     reader = VideoReader.open(CLIPS / name)
     levels = np.array([image.mean() for image in reader.frames()])
     assert reader.num_frames == len(levels) == 19
@@ -53,9 +53,7 @@ def test_video_reader__has_the_shown_frames_of_hevc_with_sound(name: str) -> Non
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("file", ["a.mp4 mp4v", "a.mov mpg2"])
-def test_video_reader__has_the_frames_that_the_edit_list_shows(
-    tmp_path: Path, file: str, part: str
-) -> None:
+def test_video_reader__has_the_frames_that_the_edit_list_shows(tmp_path, file, part):
     """With frames that refer to later ones in mpg2; live plays the same frames."""
     name, codec = file.split()
     parts, frames = PARTS[part]
@@ -72,7 +70,7 @@ def test_video_reader__has_the_frames_that_the_edit_list_shows(
     assert [number(image) for image in reader.pick([last])] == [frames[-1]]  # type: ignore[arg-type]
 
 
-def test_play__shows_the_frames_of_the_reader(tmp_path: Path) -> None:
+def test_play__shows_the_frames_of_the_reader(tmp_path):
     write_video(tmp_path / "a.mp4", clip(20), 100, "mpg2")
     show_parts(tmp_path / "a.mp4", [(0.05, 0.08)])
     played = [number(image) for image in play(tmp_path / "a.mp4", ClipClock(), Event())]
@@ -83,7 +81,7 @@ def test_play__shows_the_frames_of_the_reader(tmp_path: Path) -> None:
     )
 
 
-def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_path: Path) -> None:
+def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_path):
     write_timed_video(tmp_path / "a.mp4", clip(8), [0, 50, 100, 150, 300, 350, 400, 450])
     reader = VideoReader.open(show_parts(tmp_path / "a.mp4", [(0.1, 0.3)]))
     assert [number(image) for image in reader.frames()] == [2, 3, 4, 5]
@@ -91,7 +89,7 @@ def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_
     np.testing.assert_allclose(reader.positions, [0, 1, 4, 5], atol=0.05)
 
 
-def test_video_reader__has_the_rate_of_its_time_stamps(tmp_path: Path) -> None:
+def test_video_reader__has_the_rate_of_its_time_stamps(tmp_path):
     times = [round(1000 * t / 29.83) for t in range(60)]
     write_timed_video(tmp_path / "a.mp4", [image[:, :48] for image in clip(60)], times)
     reader = VideoReader.open(tmp_path / "a.mp4")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ RGBA = np.dstack(
 
 
 @pytest.mark.parametrize("suffix", [".TIFF", ".webp", ".BMP", ".JPEG"])
-def test_folder_reader__reads_every_format_and_upper_case(tmp_path: Path, suffix: str) -> None:
+def test_folder_reader__reads_every_format_and_upper_case(tmp_path, suffix):
     for t in range(2):
         image = np.full((40, 60, 3), 100 + t, np.uint8)
         (tmp_path / f"{t}{suffix}").write_bytes(cv2.imencode(suffix.lower(), image)[1].tobytes())
@@ -28,9 +26,7 @@ def test_folder_reader__reads_every_format_and_upper_case(tmp_path: Path, suffix
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".webp", ".png"])
-def test_folder_reader__masks_transparent_pixels_of_every_format(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_folder_reader__masks_transparent_pixels_of_every_format(tmp_path, suffix):
     file = tmp_path / f"0{suffix}"
     file.write_bytes(cv2.imencode(suffix, RGBA)[1].tobytes())
     mask, note = opaque_pixels(FolderReader.of_files([file]), "cam")

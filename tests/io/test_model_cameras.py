@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-from pathlib import Path
 
 import numpy as np
-import pytest
 
 from morgs_mi.io.model_cameras import model_cameras
 
 
-def test_model_cameras__names_keys_that_it_does_not_understand_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_model_cameras__names_keys_that_it_does_not_understand_once(tmp_path, caplog):
     row = {
         "id": 0,
         "img_name": "a",

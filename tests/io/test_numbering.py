@@ -22,7 +22,7 @@ from morgs_mi.io.numbering import frame_numbers
         ([f"{10**20}_a1", f"{10**20 + 1}_a1"], [10**20, 10**20 + 1]),
     ],
 )
-def test_frame_numbers__are_those_that_change(names: list[str], numbers: list[int]) -> None:
+def test_frame_numbers__are_those_that_change(names, numbers):
     assert frame_numbers(Path("cam1"), names) == numbers
 
 
@@ -35,6 +35,6 @@ def test_frame_numbers__are_those_that_change(names: list[str], numbers: list[in
         (["0000", "b"], "a number in each name, got b; rename it"),
     ],
 )
-def test_frame_numbers__refuses_equal_numbers_and_none(names: list[str], message: str) -> None:
+def test_frame_numbers__refuses_equal_numbers_and_none(names, message):
     with pytest.raises(ValueError, match=f"^cam1: expected {message}"):
         frame_numbers(Path("cam1"), names)

@@ -24,7 +24,7 @@ def workers() -> int:
     return sum(thread.name == "prefetch" for thread in threading.enumerate())
 
 
-def test_prefetched__preserves_the_order_and_runs_in_another_thread() -> None:
+def test_prefetched__preserves_the_order_and_runs_in_another_thread():
     made_by = set()
 
     def items():
@@ -37,7 +37,7 @@ def test_prefetched__preserves_the_order_and_runs_in_another_thread() -> None:
     wait_until(lambda: workers() == 0)
 
 
-def test_prefetched__produces_a_bounded_number_of_items_ahead() -> None:
+def test_prefetched__produces_a_bounded_number_of_items_ahead():
     made = []
 
     def items():
@@ -54,7 +54,7 @@ def test_prefetched__produces_a_bounded_number_of_items_ahead() -> None:
     wait_until(lambda: workers() == 0)
 
 
-def test_prefetched__raises_an_error_in_place_of_the_item() -> None:
+def test_prefetched__raises_an_error_in_place_of_the_item():
     def items():
         yield 1
         raise ValueError("the disk is gone")
@@ -65,7 +65,7 @@ def test_prefetched__raises_an_error_in_place_of_the_item() -> None:
         next(ahead)
 
 
-def test_prefetched__closes_the_source() -> None:
+def test_prefetched__closes_the_source():
     closed = []
 
     def items():
@@ -81,7 +81,7 @@ def test_prefetched__closes_the_source() -> None:
     wait_until(lambda: closed == [True])
 
 
-def test_prefetched__yields_the_newest_item_of_a_source_that_cannot_wait() -> None:
+def test_prefetched__yields_the_newest_item_of_a_source_that_cannot_wait():
     made = []
     release = threading.Event()
 
@@ -99,7 +99,7 @@ def test_prefetched__yields_the_newest_item_of_a_source_that_cannot_wait() -> No
     assert list(ahead) == [49]
 
 
-def test_prefetched__lets_the_interpreter_end_while_an_item_is_produced() -> None:
+def test_prefetched__lets_the_interpreter_end_while_an_item_is_produced():
     """A thread that resumes in library code after the end of the interpreter aborts the process."""
     script = (
         "import cv2, numpy as np\n"

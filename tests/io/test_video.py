@@ -34,7 +34,7 @@ def smooth_clip(count: int = COUNT, speed: int = 1) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
-def test_write_video__is_lossless_by_default(tmp_path: Path, name: str) -> None:
+def test_write_video__is_lossless_by_default(tmp_path, name):
     write_video(tmp_path / name, clip(), fps=12.5)
     reader = open_frames(tmp_path / name)
     assert (reader.num_frames, reader.width, reader.height) == (COUNT, WIDTH, HEIGHT)
@@ -45,16 +45,14 @@ def test_write_video__is_lossless_by_default(tmp_path: Path, name: str) -> None:
     assert [f.name for f in tmp_path.iterdir()] == [name]
 
 
-def test_folder_reader__reads_in_numerical_order(tmp_path: Path) -> None:
+def test_folder_reader__reads_in_numerical_order(tmp_path):
     for i, frame in enumerate(clip(count=12)):
         cv2.imwrite(str(tmp_path / f"{i}.png"), frame[..., ::-1])
     np.testing.assert_array_equal(list(FolderReader.open(tmp_path).frames()), clip(count=12))
 
 
 @pytest.mark.parametrize("codec", ["mp4v", PLAYABLE])
-def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(
-    tmp_path: Path, codec: str
-) -> None:
+def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(tmp_path, codec):
     write_video(tmp_path / "cam.mp4", smooth_clip(), 30, codec)
     got = np.array(list(VideoReader.open(tmp_path / "cam.mp4").frames()), float)
     # 4:2:0 chroma and the encoders' default rates; a swap of red and blue would give 13 dB.
@@ -70,9 +68,7 @@ def long_video(path: Path, codec: str) -> Path:
 
 
 @pytest.mark.parametrize("name", ["a.mp4 mpg2", "a.mkv mpg2", "a.avi mpg2"])
-def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(
-    tmp_path: Path, name: str
-) -> None:
+def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(tmp_path, name):
     file, codec = name.split()
     reader = VideoReader.open(long_video(tmp_path / file, codec))
     whole = list(reader.frames())
@@ -93,8 +89,8 @@ def truncated(path: Path, length: int) -> Path:
 
 
 def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the_missing_one(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     path = tmp_path / "cam.mkv"
     write_video(path, clip(), 30)
     reader = VideoReader.open(truncated(path, path.stat().st_size // 2))
@@ -138,9 +134,7 @@ def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the
         ),
     ],
 )
-def test_open_frames__refuses_bad_input(
-    tmp_path: Path, name: str, damage, error: type[Exception], message: str
-) -> None:
+def test_open_frames__refuses_bad_input(tmp_path, name, damage, error, message):
     write_video(tmp_path / name, clip(), 30)
     damage(tmp_path / name)
     with pytest.raises(error, match=message):
@@ -155,8 +149,8 @@ def test_open_frames__refuses_bad_input(
     ],
 )
 def test_video_reader__has_the_positions_of_a_variable_frame_rate(
-    tmp_path: Path, name: str, codec: str, times: list[int], fps: float, error: float
-) -> None:
+    tmp_path, name, codec, times, fps, error
+):
     """In AVI files, a recorder writes an empty chunk for each frame that it drops."""
     write_timed_video(tmp_path / name, smooth_clip(), times, codec)
     reader = VideoReader.open(tmp_path / name)
@@ -177,9 +171,7 @@ def test_video_reader__has_the_positions_of_a_variable_frame_rate(
         ("cam.avi", "MJPG", 29.97),
     ],
 )
-def test_video_reader__recognises_a_constant_frame_rate(
-    tmp_path: Path, name: str, codec: str, fps: float
-) -> None:
+def test_video_reader__recognises_a_constant_frame_rate(tmp_path, name, codec, fps):
     write_video(tmp_path / name, clip(count=30), fps, codec)
     reader = VideoReader.open(tmp_path / name)
     assert (reader.num_frames, reader.positions) == (30, None)
@@ -200,9 +192,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_video_reader__reads_the_containers_and_codecs_of_cameras(
-    tmp_path: Path, kind: str
-) -> None:
+def test_video_reader__reads_the_containers_and_codecs_of_cameras(tmp_path, kind):
     """With frames that refer to later ones where the codec has them."""
     name, codec = kind.split()
     images = [np.full((64, 96, 3), 30 + 12 * t, np.uint8) for t in range(16)]
@@ -214,7 +204,7 @@ def test_video_reader__reads_the_containers_and_codecs_of_cameras(
     np.testing.assert_allclose(levels, 30 + 12 * np.arange(16), atol=4)
 
 
-def test_video_reader__leaves_out_a_broken_frame_and_no_other(tmp_path: Path) -> None:
+def test_video_reader__leaves_out_a_broken_frame_and_no_other(tmp_path):
     write_timed_video(tmp_path / "a.avi", smooth_clip(), range(0, 240, 40), "mjpeg")
     data = (tmp_path / "a.avi").read_bytes()
     at = [match.start() for match in re.finditer(b"\xff\xd8\xff", data)]
@@ -225,7 +215,7 @@ def test_video_reader__leaves_out_a_broken_frame_and_no_other(tmp_path: Path) ->
         assert np.abs(np.int16(image) - smooth_clip()[expected]).mean() < 6
 
 
-def test_video_reader__shows_no_damaged_frame_in_place_of_another(tmp_path: Path) -> None:
+def test_video_reader__shows_no_damaged_frame_in_place_of_another(tmp_path):
     """A transport stream that has lost a packet of 188 bytes, as by radio."""
     noise = np.random.default_rng(0).integers(0, 255, (64, 96, 3)).astype(np.uint8) // 4
     path = tmp_path / "a.ts"
@@ -243,7 +233,7 @@ def test_video_reader__shows_no_damaged_frame_in_place_of_another(tmp_path: Path
     np.testing.assert_allclose(levels, reader.positions, atol=0.5)
 
 
-def test_video_reader__turns_images_as_players_do(tmp_path: Path) -> None:
+def test_video_reader__turns_images_as_players_do(tmp_path):
     image = np.zeros((32, 64, 3), np.uint8)
     image[:8, :8] = 255  # the corner at the top left comes to the top right
     write_timed_video(tmp_path / "a.mp4", [image], [0], rotation=-90)
@@ -252,16 +242,14 @@ def test_video_reader__turns_images_as_players_do(tmp_path: Path) -> None:
     np.testing.assert_array_equal(next(reader.frames()), np.rot90(image, -1))
 
 
-def test_video_reader__takes_a_colon_as_part_of_a_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_video_reader__takes_a_colon_as_part_of_a_path(tmp_path, monkeypatch):
     """In names of recorders, which a program could take for a protocol; written and read."""
     monkeypatch.chdir(tmp_path)
     write_video("12:30:00/a.mkv", clip(), 30)
     assert open_frames("12:30:00/a.mkv").num_frames == COUNT
 
 
-def test_video_reader__names_an_unknown_codec(tmp_path: Path) -> None:
+def test_video_reader__names_an_unknown_codec(tmp_path):
     write_timed_video(tmp_path / "a.mp4", smooth_clip(), range(0, 240, 40), "libx264")
     data = (tmp_path / "a.mp4").read_bytes()
     (tmp_path / "a.mp4").write_bytes(data.replace(b"avc1", b"zzzz"))
@@ -269,7 +257,7 @@ def test_video_reader__names_an_unknown_codec(tmp_path: Path) -> None:
         VideoReader.open(tmp_path / "a.mp4")
 
 
-def test_video_reader__refuses_time_stamps_of_years(tmp_path: Path) -> None:
+def test_video_reader__refuses_time_stamps_of_years(tmp_path):
     write_timed_video(tmp_path / "cam.mkv", clip(), [0, 33, 67, 100, 133, 200_000_000])
     with pytest.raises(
         ValueError,
@@ -278,7 +266,7 @@ def test_video_reader__refuses_time_stamps_of_years(tmp_path: Path) -> None:
         VideoReader.open(tmp_path / "cam.mkv")
 
 
-def test_folder_reader__ignores_the_rotation_of_exif(tmp_path: Path) -> None:
+def test_folder_reader__ignores_the_rotation_of_exif(tmp_path):
     jpeg = cv2.imencode(".jpg", np.zeros((16, 32, 3), np.uint8))[1].tobytes()
     # One entry, orientation (0x112) 6: rotated by 90 degrees.
     tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
@@ -310,15 +298,13 @@ def interrupted():
         ("cam.mp4", interrupted(), "FFV1", KeyboardInterrupt, "Ctrl-C"),
     ],
 )
-def test_write_video__leaves_nothing_on_failure(
-    tmp_path: Path, name, frames, codec, error, message
-) -> None:
+def test_write_video__leaves_nothing_on_failure(tmp_path, name, frames, codec, error, message):
     with pytest.raises(error, match=message):
         write_video(tmp_path / name, frames, 30, codec)
     assert not list(tmp_path.iterdir())
 
 
-def test_write_video__leaves_the_old_file_on_failure(tmp_path: Path) -> None:
+def test_write_video__leaves_the_old_file_on_failure(tmp_path):
     for name, error in (("cam.mp4", ValueError), ("cam", FileExistsError)):
         write_video(tmp_path / name, clip(), 30)
         with pytest.raises(error, match=r"at least one frame|cam: expected a new folder"):
@@ -327,7 +313,7 @@ def test_write_video__leaves_the_old_file_on_failure(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cam.mp4", "cam"])
-def test_write_video__raises_and_leaves_nothing_on_a_full_disk(tmp_path: Path, name: str) -> None:
+def test_write_video__raises_and_leaves_nothing_on_a_full_disk(tmp_path, name):
     with pytest.raises(OSError, match=name), files_end_at(3000):
         write_video(tmp_path / name, clip(), 30)
     assert not list(tmp_path.iterdir())

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +42,7 @@ def capture_of(stream: StreamReader) -> Capture:
 
 
 @pytest.mark.usefixtures("small_images")
-def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> None:
+def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip):
     small = load_capture(fitted_clip / "capture", downscale=2)
     full, half = (truth_for_camera(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
     assert full is not None
@@ -54,7 +52,7 @@ def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> Non
     assert truth_for_camera(small, CAMERAS[0], FRAMES) is None
 
 
-def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_path: Path) -> None:
+def test_render_stream__renders_the_available_channels(fitted_clip, tmp_path):
     reader = open_stream(fitted_clip)
     frames = list(render_stream(reader, find_camera(reader, 1)))
     assert [index for index, _ in frames] == list(range(FRAMES))
@@ -68,7 +66,7 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
     assert "confidence" not in next(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0]))[1]
 
 
-def test_render_config__ignores_settings_that_went() -> None:
+def test_render_config__ignores_settings_that_went():
     """The streams of the gallery have `reproducible` in their headers."""
     stream = open_stream(Path(__file__).parents[2] / "docs/gallery/spheres.morgs")
     assert "reproducible" in stream.metadata["config"]["render"]
@@ -112,8 +110,8 @@ def test_render_config__ignores_settings_that_went() -> None:
     ],
 )
 def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
-    tmp_path: Path, metadata: dict[str, Any], read: Callable[[StreamReader], Any], message: str
-) -> None:
+    tmp_path, metadata, read, message
+):
     write_stream(tmp_path / "s.morgs", {"capture": str(tmp_path), **metadata})
     stream = open_stream(tmp_path / "s.morgs")
     with pytest.raises(ValueError, match=rf"s.morgs: packet 0: .*{message}"):
@@ -121,7 +119,7 @@ def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
     assert len(list(stream)) == FRAMES
 
 
-def test_find_camera__by_index_and_name(fitted_clip: Path) -> None:
+def test_find_camera__by_index_and_name(fitted_clip):
     stream = open_stream(fitted_clip)
     assert [find_camera(stream, camera).name for camera in (1, "1", "cam0")] == [
         "cam1",
@@ -133,7 +131,7 @@ def test_find_camera__by_index_and_name(fitted_clip: Path) -> None:
             find_camera(stream, camera)
 
 
-def test_has_confidence__only_where_it_was_learned(fitted_clip: Path, tmp_path: Path) -> None:
+def test_has_confidence__only_where_it_was_learned(fitted_clip, tmp_path):
     assert has_confidence(open_stream(fitted_clip))
     off = {"config": {"motion": {"learn_confidence": False}}}
     write_stream(tmp_path / "off.morgs", off)
@@ -142,9 +140,7 @@ def test_has_confidence__only_where_it_was_learned(fitted_clip: Path, tmp_path: 
     assert not has_confidence(open_stream(tmp_path / "none.morgs"))
 
 
-def test_render_stream__offset_is_its_share_of_the_motion(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip, tmp_path):
     write_stream(tmp_path / "s.morgs", {}, offset=0.25)
     assert has_offset(open_stream(tmp_path / "s.morgs"))
     assert not has_offset(open_stream(fitted_clip))
@@ -161,9 +157,7 @@ def test_render_stream__offset_is_its_share_of_the_motion(
     np.testing.assert_array_equal(tenth, channel_image("motion", images["offset"] + 0.5))
 
 
-def test_playback_speed__is_the_inverse_of_the_time_per_frame(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_playback_speed__is_the_inverse_of_the_time_per_frame(fitted_clip, tmp_path):
     config = RenderConfig()
     reader = open_stream(fitted_clip)
     times = playback_speed(reader, reader.cameras[0], config)
@@ -177,7 +171,7 @@ def test_playback_speed__is_the_inverse_of_the_time_per_frame(
     assert playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0], config)["fps"] > 0
 
 
-def test_channel_image__draws_other_channels_as_grey_values() -> None:
+def test_channel_image__draws_other_channels_as_grey_values():
     ramp = np.linspace(0, 1, 8, dtype=np.float32)[None, :, None]
     image = channel_image("wetness", ramp)
     assert (image == image[..., :1]).all()
@@ -185,9 +179,7 @@ def test_channel_image__draws_other_channels_as_grey_values() -> None:
 
 
 @pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
-def test_open_stream_capture__finds_the_capture_of_the_fit(
-    fitted_clip: Path, tmp_path: Path, stored: str
-) -> None:
+def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip, tmp_path, stored):
     capture = str(fitted_clip / "capture")
     header = {"test_view": 0}
     if stored != "beside":
@@ -202,8 +194,8 @@ def test_open_stream_capture__finds_the_capture_of_the_fit(
 
 @pytest.mark.parametrize("refine", ["off", "on"])
 def test_open_stream_capture__recognises_the_recording_by_its_fingerprint(
-    fitted_clip: Path, tmp_path: Path, refine: str
-) -> None:
+    fitted_clip, tmp_path, refine
+):
     capture = load_capture(fitted_clip / "capture", test_view=0)
     mark = fingerprint(capture, next(capture.partial_frames()).images, refine == "on")
     for mark_of_stream, refused in ((mark, False), ("0" * 16, True), (None, False)):
@@ -226,9 +218,7 @@ def test_open_stream_capture__recognises_the_recording_by_its_fingerprint(
         )
 
 
-def test_open_stream_capture__asks_for_a_capture_that_has_moved(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
+def test_open_stream_capture__asks_for_a_capture_that_has_moved(fitted_clip, tmp_path):
     write_stream(tmp_path / "stream.morgs", {"test_view": 0, "capture": ["x"]})
     for content in ("{", '{"capture": 3}'):
         (tmp_path / "capture.json").write_text(content)

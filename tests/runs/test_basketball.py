@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,9 +27,7 @@ CUT = 27
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FOLDER, reason="needs a recording: set MORGS_MI_BASKETBALL to its folder")
-def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
-    tmp_path: Path,
-) -> None:
+def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(tmp_path):
     out = tmp_path / "out"
     command = [
         "fit",

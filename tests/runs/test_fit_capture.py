@@ -112,9 +112,7 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
 
 
 @pytest.mark.slow
-def test_stream_capture__shows_a_provisional_first_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stream_capture__shows_a_provisional_first_frame(tmp_path, monkeypatch):
     """A stream beside the one that is written has a frame for each round of density control, and is
     removed before the result is written.
     """
@@ -147,8 +145,8 @@ def test_stream_capture__shows_a_provisional_first_frame(
 
 @pytest.mark.slow
 def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_room(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    whole, tmp_path, monkeypatch, caplog
+):
     write = StreamWriter.write
 
     def full(writer: StreamWriter, packet: Packet) -> int:
@@ -179,9 +177,7 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(whole, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
 
@@ -199,7 +195,7 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
 
 
 @pytest.mark.slow
-def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__replaces_an_earlier_fit_together(whole, tmp_path):
     out = tmp_path / "out"
     push = StreamLoop.push
     frames = []
@@ -229,8 +225,8 @@ def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path:
 @pytest.mark.slow
 @pytest.mark.parametrize("calls", range(1, 5))
 def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
-) -> None:
+    whole, tmp_path, monkeypatch, calls
+):
     """Whatever has been replaced, the files that are there after the next start belong together."""
     out = tmp_path / "out"
     count = 0
@@ -261,12 +257,12 @@ def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces
 
 
 @pytest.mark.slow
-def test_stream_capture__killed_and_resumed_is_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__killed_and_resumed_is_the_same(whole, tmp_path):
     kill_and_resume(whole, tmp_path, 3)
 
 
 @pytest.mark.long
-def test_stream_capture__killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__killed_60_times_is_the_same(whole, tmp_path):
     kill_and_resume(whole, tmp_path, 60)
 
 
@@ -281,7 +277,7 @@ def cuts(whole: Path) -> list[int]:
 
 
 @pytest.mark.slow
-def test_stream_capture__resumed_from_any_cut_is_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__resumed_from_any_cut_is_the_same(whole, tmp_path):
     report = json.loads((whole / "report.json").read_text())
     for k, at in enumerate(cuts(whole)):
         out = interrupted(whole, tmp_path / f"{at}", at)
@@ -296,9 +292,7 @@ def test_stream_capture__resumed_from_any_cut_is_the_same(whole: Path, tmp_path:
         assert_same(out, whole)
 
 
-def test_stream_capture__resumed_after_an_interrupt_is_the_same(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_stream_capture__resumed_after_an_interrupt_is_the_same(whole, tmp_path):
     """The stream was closed, with an index that must not stay in the middle."""
 
     def stop(stage: str, done: float, total: float) -> None:
@@ -345,9 +339,7 @@ def brighter(capture: Recording) -> Recording:
         (recording(cameras=recording().cameras[::-1]), CONFIG, "resume a fit with cameras = "),
     ],
 )
-def test_stream_capture__does_not_resume_another_fit(
-    whole: Path, tmp_path: Path, capture, config, message: str
-) -> None:
+def test_stream_capture__does_not_resume_another_fit(whole, tmp_path, capture, config, message):
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) // 2)
     old_stream = stream_of(out)
     with pytest.raises(ValueError, match=message):
@@ -355,7 +347,7 @@ def test_stream_capture__does_not_resume_another_fit(
     assert stream_of(out) == old_stream
 
 
-def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__does_not_resume_a_damaged_fit(whole, tmp_path):
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
     damaged = bytearray(stream_of(whole))
     damaged[len(damaged) // 2] ^= 1
@@ -366,9 +358,7 @@ def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole, tmp_path):
     """The other one goes on, and its files are whole."""
     refused = {}
 
@@ -388,9 +378,7 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["removed", "moved", "replaced"])
-def test_stream_capture__ends_when_its_stream_is_taken_away(
-    whole: Path, tmp_path: Path, change: str
-) -> None:
+def test_stream_capture__ends_when_its_stream_is_taken_away(whole, tmp_path, change):
     out = tmp_path / "out"
     reports = []
 
@@ -424,7 +412,7 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(
         assert_same(tmp_path / "moved", whole)
 
 
-def test_stream_metadata__has_no_path(tmp_path: Path) -> None:
+def test_stream_metadata__has_no_path(tmp_path):
     """A stream is shared; its capture is named in the file beside it."""
     secret = tmp_path / "home" / "jane"
     methods = replace(
@@ -442,9 +430,7 @@ def test_stream_metadata__has_no_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stream_capture__resumes_a_stream_whose_header_has_a_path(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole, tmp_path):
     """As the headers of earlier versions have; the recording may have moved."""
     reader = StreamReader(whole / "stream.morgs")
     out = tmp_path / "out"
@@ -460,7 +446,7 @@ def test_stream_capture__resumes_a_stream_whose_header_has_a_path(
     assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
 
 
-def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__resumes_beside_a_hostile_description(whole, tmp_path):
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) * 3 // 4)
     (out / "capture.json").write_text("[]")
     stream_capture(recording(), out, CONFIG, resume=True)
@@ -480,9 +466,7 @@ def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_p
     ],
     ids=["broken", "empty", "large", "missing"],
 )
-def test_stream_capture__refuses_a_hostile_or_missing_report(
-    whole: Path, tmp_path: Path, text: str | None, message: str
-) -> None:
+def test_stream_capture__refuses_a_hostile_or_missing_report(whole, tmp_path, text, message):
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
     (out / "report.json").unlink()
     if text is not None:
@@ -492,9 +476,7 @@ def test_stream_capture__refuses_a_hostile_or_missing_report(
 
 
 @pytest.mark.slow
-def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole, tmp_path):
     clip = Clip(stream_of(whole), pieces_of(stream_of(whole)), {})
     out = tmp_path / "out"
     for case in range(12):
@@ -511,7 +493,7 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
         assert refusal.startswith(f"{out}/") or StreamReader(out / "stream.morgs").seek(FRAMES - 1)
 
 
-def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path: Path) -> None:
+def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path):
     capture = colmap(tmp_path / "clip")
     (capture / "capture.json").write_text("{}")
     out = tmp_path / "out"
@@ -524,7 +506,7 @@ def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path: 
     assert (capture / "capture.json").read_text() == "{}"
 
 
-def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
+def test_with_next__yields_the_frames_before_one_that_cannot_be_read():
     def frames():
         yield from "ab"
         raise OSError("the video ends here")

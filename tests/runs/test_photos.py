@@ -35,7 +35,7 @@ SETS = {
     not FOLDER, reason="needs photos: set MORGS_MI_PHOTOS to the folder of their sets"
 )
 @pytest.mark.parametrize("name", SETS)
-def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_path: Path) -> None:
+def test_photos__are_calibrated_and_reach_the_committed_quality(name, tmp_path):
     photos = tmp_path / name
     count, points = SETS[name]
     photos.mkdir()

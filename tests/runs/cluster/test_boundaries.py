@@ -14,7 +14,7 @@ from tests.scenes.recording import CONFIG, recording
 
 
 @pytest.mark.slow
-def test_fit_boundary_frame__leaves_what_is_static_as_it_is() -> None:
+def test_fit_boundary_frame__leaves_what_is_static_as_it_is():
     capture = recording()
     settings = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=400))
     loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, settings)
@@ -32,7 +32,7 @@ def test_fit_boundary_frame__leaves_what_is_static_as_it_is() -> None:
     assert decode(None, reemitted_keyframe(coded)).next_id >= base.next_id, "ids go on"
 
 
-def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
+def test_fit_config__has_other_seeds_and_rates_for_each_pass():
     first, second = (ChunkConfig().fit_config(CONFIG, number) for number in (0, 1))
     assert first.seed != second.seed
     assert first.fit.rates.scales == pytest.approx(2 * CONFIG.fit.rates.scales)

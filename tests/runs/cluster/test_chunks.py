@@ -87,9 +87,7 @@ def rows_of(out: Path) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_ChunkedRun__of_one_is_the_fit_in_one_process(
-    capture: Capture, client: Client, tmp_path: Path
-) -> None:
+def test_ChunkedRun__of_one_is_the_fit_in_one_process(capture, client, tmp_path):
     fit(capture, tmp_path / "one", client, chunks=ChunkConfig(1))
     stream_capture(capture, tmp_path / "plain", SETTINGS)
     assert stream_of(tmp_path / "one") == stream_of(tmp_path / "plain")
@@ -98,7 +96,7 @@ def test_ChunkedRun__of_one_is_the_fit_in_one_process(
 
 
 @pytest.mark.slow
-def test_ChunkedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
+def test_ChunkedRun__joins_them_to_an_ordinary_stream(whole):
     reader = StreamReader(whole / "stream.morgs")
     assert reader.closed()
     assert sorted(path.name for path in whole.iterdir()) == sorted(FILES)
@@ -117,7 +115,7 @@ def test_ChunkedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ChunkedRun__reports_frames_and_workers(whole: Path) -> None:
+def test_ChunkedRun__reports_frames_and_workers(whole):
     report = json.loads((whole / "report.json").read_text())
     packets = reversed(list(StreamReader(whole / "stream.morgs")))
     sizes = {packet.frame: packet.num_bytes for packet in packets}
@@ -144,9 +142,7 @@ def interrupt() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 5])
-def test_ChunkedRun__interrupted_and_resumed_is_the_same(
-    capture: Capture, client: Client, whole: Path, tmp_path: Path, count: int
-) -> None:
+def test_ChunkedRun__interrupted_and_resumed_is_the_same(capture, client, whole, tmp_path, count):
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(count, interrupt))
     fit(capture, tmp_path, client, resume=True)
@@ -160,8 +156,8 @@ def test_ChunkedRun__interrupted_and_resumed_is_the_same(
 # After the first frame of a chunk alone, and within a packet.
 @pytest.mark.parametrize(("frame", "more"), [(4, 0), (8, 40)])
 def test_ChunkedRun__resumes_after_the_beginning_of_a_chunk(
-    capture: Capture, client: Client, whole: Path, tmp_path: Path, frame: int, more: int
-) -> None:
+    capture, client, whole, tmp_path, frame, more
+):
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(FRAMES, interrupt))
     for path in (tmp_path / "chunks").glob("*.morgs"):
@@ -174,9 +170,7 @@ def test_ChunkedRun__resumes_after_the_beginning_of_a_chunk(
 
 
 @pytest.mark.slow
-def test_ChunkedRun__with_a_killed_process_is_the_same(
-    capture: Capture, client: Client, whole: Path, tmp_path: Path
-) -> None:
+def test_ChunkedRun__with_a_killed_process_is_the_same(capture, client, whole, tmp_path):
     def kill() -> None:
         """Kill a worker's process; its nanny starts a new one."""
         os.kill(list(client.run(os.getpid).values())[-1], signal.SIGKILL)
@@ -185,7 +179,7 @@ def test_ChunkedRun__with_a_killed_process_is_the_same(
     assert stream_of(tmp_path) == stream_of(whole)
 
 
-def test_ChunkedRun__refuses_too_many(capture: Capture, client, tmp_path: Path) -> None:
+def test_ChunkedRun__refuses_too_many(capture, client, tmp_path):
     message = r"`chunks` must be 1 to 5 for 10 frames, 2 for each, got 6"
     with pytest.raises(ValueError, match=message):
         fit(capture, tmp_path / "out", client, chunks=ChunkConfig(6))
@@ -193,9 +187,7 @@ def test_ChunkedRun__refuses_too_many(capture: Capture, client, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_ChunkedRun__does_not_resume_other_settings(
-    capture: Capture, client: Client, tmp_path: Path
-) -> None:
+def test_ChunkedRun__does_not_resume_other_settings(capture, client, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(2, interrupt))
     with pytest.raises(
@@ -211,8 +203,8 @@ def test_ChunkedRun__does_not_resume_other_settings(
 
 @pytest.mark.slow
 def test_ChunkedRun__keeps_an_earlier_fit_until_the_chunks_are_joined(
-    capture: Capture, client: Client, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, client, whole, tmp_path, monkeypatch
+):
     out = shutil.copytree(whole, tmp_path / "out")
     other = replace(SETTINGS, seed=1)
     with pytest.raises(KeyboardInterrupt):
@@ -233,8 +225,8 @@ def test_ChunkedRun__keeps_an_earlier_fit_until_the_chunks_are_joined(
 
 @pytest.mark.slow
 def test_ChunkedRun__triangulates_points_where_there_are_few(
-    capture: Capture, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capture, client, tmp_path, monkeypatch
+):
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
     monkeypatch.setattr("morgs_mi.runs.fit_capture.with_points", lambda *_: capture)
     fit(
@@ -251,7 +243,7 @@ def test_ChunkedRun__triangulates_points_where_there_are_few(
 
 
 @pytest.mark.slow
-def test_ChunkedRun__refines_cameras_once(capture: Capture, client: Client, tmp_path: Path) -> None:
+def test_ChunkedRun__refines_cameras_once(capture, client, tmp_path):
     held_out = load_capture(capture.path, test_view=0)
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
@@ -271,9 +263,7 @@ def test_ChunkedRun__refines_cameras_once(capture: Capture, client: Client, tmp_
 
 
 @pytest.mark.slow
-def test_ChunkedRun__has_the_same_balance_of_the_cameras_in_all_chunks(
-    capture: Capture, client: Client, tmp_path: Path
-) -> None:
+def test_ChunkedRun__has_the_same_balance_of_the_cameras_in_all_chunks(capture, client, tmp_path):
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, exposure="on", short_fits=how))
     fit(capture, tmp_path / "three", client, config=config)
@@ -308,13 +298,8 @@ def cluster() -> Iterator[subprocess.Popen[str]]:
 
 @pytest.mark.slow
 def test_ChunkedRun__names_a_lost_scheduler_and_is_resumed(
-    capture: Capture,
-    client: Client,
-    whole: Path,
-    cluster: subprocess.Popen[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    capture, client, whole, cluster, tmp_path, monkeypatch
+):
     monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 2)
     assert cluster.stdout is not None
     lost = when_fitted(4, cluster.kill)

@@ -46,7 +46,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_cluster_page__commands_run(workplace: Path) -> None:
+def test_cluster_page__commands_run(workplace):
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -72,6 +72,6 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
         )
 
 
-def test_cluster_page__has_commands() -> None:
+def test_cluster_page__has_commands():
     kinds = ["run", "start", "start", "run"]
     assert [kind for kind, _ in BLOCKS] == kinds

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import mitsuba as mi
 import pytest
@@ -24,9 +23,7 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
 
 
 @pytest.mark.slow
-def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
-    fit: Fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(fit, monkeypatch):
     first = fit_frames(fit, Chunk(0, 5, 0), 3)
     assert first.chunk == replace(first.chunk, start=0, stop=5, frame=3)
     monkeypatch.setattr(Fit, "open", None)
@@ -39,7 +36,7 @@ def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
 
 
 @pytest.mark.slow
-def test_fit_frames__begins_a_chunk_with_a_keyframe_after_the_common_model(fit: Fit) -> None:
+def test_fit_frames__begins_a_chunk_with_a_keyframe_after_the_common_model(fit):
     common = fit_frames(fit, Chunk(0, 2, 0), 2)
     assert common.chunk.coded is not None
     start = (reemitted_keyframe(common.chunk.coded).encoded,)
@@ -52,7 +49,7 @@ def test_fit_frames__begins_a_chunk_with_a_keyframe_after_the_common_model(fit: 
     assert [report.num_bytes for report in part.reports] == [len(packet) for packet in part.packets]
 
 
-def test_fit_frames__refuses_other_versions(fit: Fit) -> None:
+def test_fit_frames__refuses_other_versions(fit):
     versions = tuple((name, "0.1" if name == "drjit" else version) for name, version in installed())
     with pytest.raises(
         ValueError, match=r"expected a worker with drjit 0\.1 like the client, got 1\.5\.0; install"
@@ -60,7 +57,7 @@ def test_fit_frames__refuses_other_versions(fit: Fit) -> None:
         fit_frames(replace(fit, versions=versions), Chunk(0, 1, 0), 1)
 
 
-def test_recording_of__opens_the_capture_as_it_is(tmp_path: Path) -> None:
+def test_recording_of__opens_the_capture_as_it_is(tmp_path):
     capture = load_capture(write_recording(tmp_path, 5), 1.0, "cam1", 4)
     again = recording_of(capture)()
     assert (again.num_frames, again.test_views, again.names) == (4, (1,), capture.names)

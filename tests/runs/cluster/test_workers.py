@@ -33,7 +33,7 @@ def threads(*tasks) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_open_client__starts_workers_that_share_the_cores() -> None:
+def test_open_client__starts_workers_that_share_the_cores():
     import mitsuba as mi
 
     from morgs_mi.runs.cluster.workers import installed
@@ -48,7 +48,7 @@ def test_open_client__starts_workers_that_share_the_cores() -> None:
 
 
 @pytest.mark.slow
-def test_open_client__names_workers_that_die() -> None:
+def test_open_client__names_workers_that_die():
     import dask.config
 
     with (
@@ -63,7 +63,7 @@ def test_open_client__names_workers_that_die() -> None:
 
 
 @pytest.mark.slow
-def test_open_client__has_workers_that_end_with_their_parent() -> None:
+def test_open_client__has_workers_that_end_with_their_parent():
     script = (
         "import os, signal\n"
         "from morgs_mi.runs.cluster.workers import open_client\n"
@@ -81,7 +81,7 @@ def test_open_client__has_workers_that_end_with_their_parent() -> None:
         time.sleep(0.05)
 
 
-def test_open_client__refuses_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_client__refuses_in_one_sentence(monkeypatch):
     monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 1)
     for scheduler in ("here", "tcp://127.0.0.1:1"):
         message = f"{scheduler}: expected a scheduler with workers, got none"
@@ -89,7 +89,7 @@ def test_open_client__refuses_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -
             pass
 
 
-def test_open_client__names_the_extra_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_client__names_the_extra_that_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(ValueError, match=r"need the package distributed; pip .*morgs-mi\[cluster\]"),
