@@ -175,6 +175,7 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
             r"`a` is declared as uint8 \[1\]",
         ),
         (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, .* got NaN"),
+        (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
         (with_table(b'[["a", "object", [1]]]', bytes(8)), "table of arrays is broken"),
         (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (

@@ -12,6 +12,8 @@ import pytest
 
 from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.core.memory import check_memory, from_numpy, owned_copy, process_memory
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 from tests.quick import quick
 from tests.scenes.changing_splats import rig, splats
 
@@ -96,6 +98,10 @@ DOORS = {
     "steps": (
         lambda: StreamLoop([wide(8)], (), (), StreamConfig(fit=FitConfig(first_frame_steps=10**9))),
         "`first_frame_steps=1000000000`",
+    ),
+    "synth": (
+        lambda: synthesize("spheres", "a", SynthConfig(width=10**9, height=10**9)),
+        "images of 1000000000x1000000000 pixels",
     ),
     "views": (lambda: StreamLoop([wide(40_000)], (), ()), "1 views with 1600000000 pixels"),
 }

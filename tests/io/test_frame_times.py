@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.io.frame_times import true_rate
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.studio.live.sources import ClipClock, play
@@ -87,6 +88,13 @@ def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_
     assert [number(image) for image in reader.frames()] == [2, 3, 4, 5]
     assert reader.positions is not None
     np.testing.assert_allclose(reader.positions, [0, 1, 4, 5], atol=0.05)
+
+
+def test_true_rate__is_that_of_the_times_where_the_header_contradicts_them():
+    assert true_rate(30, 1800, 60.0) == 30
+    assert true_rate(29.97, 100, 100 / 30) == 29.97  # a tenth of a frame
+    assert true_rate(30, 1790, 60.0) == 1790 / 60
+    assert true_rate(0, 50, 2.0) == 25
 
 
 def test_video_reader__has_the_rate_of_its_time_stamps(tmp_path):

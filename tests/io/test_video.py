@@ -116,6 +116,12 @@ def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the
         ),
         (
             "cam",
+            lambda path: [file.unlink() for file in path.iterdir()],
+            FileNotFoundError,
+            r"cam: expected images \(.png",
+        ),
+        (
+            "cam",
             lambda path: (path / "0002.png").unlink(),
             ValueError,
             "numbered without gaps, got 0001.png followed by 0003.png",

@@ -169,6 +169,10 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     ("args", "message"),
     [
         (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
+        (
+            ("ply", "--frames", "a:b"),
+            "--frames must be like 12, 10:20 or 0:100:5 and select frames of",
+        ),
         (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'."),
         (
             ("ply", "a.glb"),
@@ -213,9 +217,12 @@ def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
 
 
 def test_exr_channels__names_follow_the_number_of_components():
-    images = {name: np.zeros((2, 3, k)) for name, k in (("wet", 1), ("normal", 3), ("wide", 5))}
+    images = {
+        name: np.zeros((2, 3, k))
+        for name, k in (("alpha", 1), ("wet", 1), ("normal", 3), ("wide", 5))
+    }
     normal = ["normal.X", "normal.Y", "normal.Z"]
-    assert list(exr_channels(images)) == ["wet.Y", *normal, *(f"wide.{i}" for i in range(5))]
+    assert list(exr_channels(images)) == ["A", "wet.Y", *normal, *(f"wide.{i}" for i in range(5))]
 
 
 def test_pad_to_even__repeats_the_last_row_and_column():
