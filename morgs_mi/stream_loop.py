@@ -30,7 +30,7 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.loop.first_frame import corrected, fitted_first_frame, with_first_confidence
-from morgs_mi.loop.frame_report import FittedFrame, FrameReport
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.image_status import image_status
 from morgs_mi.loop.input_images import Frame, as_array, in_order
 from morgs_mi.loop.observation import (
@@ -111,10 +111,10 @@ def step(
     if not isinstance(observation, FrameObservation):
         observation = observe_frame(setup, frame, state.history, observation)
     if state.coded is None:
-        fitted = fitted_first_frame(setup, observation, frame_progress, on_provisional)
+        packet, fitted = fitted_first_frame(setup, observation, frame_progress, on_provisional)
     else:
-        fitted = _fit_later_frame(setup, state, observation, frame_progress)
-    coded = decode(state.coded, fitted.packet)
+        packet, fitted = _fit_later_frame(setup, state, observation, frame_progress)
+    coded = decode(state.coded, packet)
     present = observation.history.images
     missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
     problems = image_status([c.name for c in setup.cameras], state.history.images, present)
@@ -123,30 +123,24 @@ def step(
             _LOG.warning("frame 0: %s", problem)
     sentences = [*([] if fitted.status == "ok" else [fitted.status]), *problems]
     later_exposures = observation.history.exposures
-    report = FrameReport(
-        frame=frame,
+    report = replace(
+        fitted,
         seconds=time.perf_counter() - start_time,
-        num_bytes=fitted.packet.num_bytes,
-        losses=fitted.losses,
-        num_gaussians=len(coded),
         status="; ".join(sentences) or "ok",
         missing_views=tuple(missing),
-        active=fitted.active,
-        validation=fitted.validation,
-        steps=fitted.steps,
         exposures=tuple(
             later_exposures.get(v, Exposure()).after(first)
             for v, first in enumerate(fitted.exposures)
         ),
     )
     next_state = StreamState(frame + 1, coded, observation.history, fitted.exposures)
-    return next_state, fitted.packet, report
+    return next_state, packet, report
 
 
 def _fit_later_frame(
     setup: Setup, state: StreamState, observation: FrameObservation, progress: Progress
-) -> FittedFrame:
-    """Return the fit of a later frame; equations are the paper's."""
+) -> tuple[Packet, FrameReport]:
+    """Return the residual of a later frame and the report of its fit; equations are the paper's."""
     assert state.coded is not None
     config = setup.config
     motion = config.motion
@@ -182,14 +176,18 @@ def _fit_later_frame(
     # The next frame starts from what a decoder reads (eq. 3).
     coder = config.codec
     packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, coder)
-    return FittedFrame(
-        packet=packet,
-        exposures=state.exposures,
+    report = FrameReport(
+        frame=state.frame,
+        seconds=0.0,
+        num_bytes=packet.num_bytes,
         losses=fitted.losses,
-        steps=fitted.epochs * len(active.views),
+        num_gaussians=len(fitted.gaussians),
         status="ok" if images else "no view has an image",
         active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
+        steps=fitted.epochs * len(active.views),
+        exposures=state.exposures,
     )
+    return packet, report
 
 
 class StreamLoop:

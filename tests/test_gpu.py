@@ -107,6 +107,7 @@ def test_losses__agree_between_cuda_and_llvm(masked):
     image = (target + rng.normal(0, 0.2, target.shape)).astype(np.float32)
     flow, drawn = rng.normal(size=(2, 37, 45, 2)).astype(np.float32)
     mask = rng.random((37, 45)) > 0.4
+    pixels = mask.size
 
     def run():
         observations = {
@@ -117,9 +118,13 @@ def test_losses__agree_between_cuda_and_llvm(masked):
         dr.enable_grad(list(observations.values()))
         reliable = from_numpy(mi.TensorXf, mask.astype(np.float32))
         losses = {
-            "recon": recon_loss(observations["recon"], Target(target, mask if masked else None)),
-            "flow": flow_loss(observations["flow"], from_numpy(mi.TensorXf, flow), reliable),
-            "mask": mask_loss(observations["mask"], reliable),
+            "recon": recon_loss(
+                observations["recon"], Target(target, mask if masked else None), 0.2
+            ),
+            "flow": flow_loss(
+                observations["flow"], from_numpy(mi.TensorXf, flow), reliable, pixels
+            ),
+            "mask": mask_loss(observations["mask"], reliable, pixels),
         }
         dr.backward(sum(losses.values()))
         gradients = {f"gradient of {name}": dr.grad(value) for name, value in observations.items()}
@@ -136,7 +141,7 @@ def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
 
     def run():
         gaussians = Gaussians(**raw)
-        region = Region(mask[..., 0] > 0)
+        region = Region.of(mask[..., 0] > 0)
         dr.enable_grad(*gaussians.items().values())
         image = rasterize(gaussians, camera, CHANNELS, region=region)
         # Blocks have another shape on CUDA and thus reach further beyond the mask.

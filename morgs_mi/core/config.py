@@ -37,6 +37,11 @@ from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 from morgs_mi.core.bounded import read_toml
 from morgs_mi.core.documentation import documented, field_docs, with_pages
 
+NonNegative = Annotated[float, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+NonNegativeInt = Annotated[int, Ge(0)]
+Count = Annotated[int, Ge(1)]
+
 Config = TypeVar("Config")
 _NONE = "none"
 _COMMENT_WIDTH = 112

@@ -19,14 +19,15 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.memory import check_memory
-from morgs_mi.fit.detail import with_num_gaussians
+from morgs_mi.core.rig import mean_views
+from morgs_mi.fit.detail import count_details
 from morgs_mi.fit.first_frame import LAST_ROUND
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, half_sized
@@ -54,26 +55,11 @@ _STEP = 16
 _GROWING = 0.75
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Gaussians and steps of a first frame."""
-
-    config: FitConfig  #: Settings with both numbers.
-    #: Time of the first frame on the reference machine; None if both numbers were given.
-    seconds: float | None = None
-
-    @property
-    def stage(self) -> str:
-        """Name of the stage in which the first frame is fitted, with its time."""
-        return (
-            "First frame"
-            if self.seconds is None
-            else f"First frame, about {max(self.seconds, 1):.0f} s"
-        )
-
-
-def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfig) -> Plan:
-    """Return the plan of a first frame.
+def plan_first_frame(
+    views: Sequence[View], points: np.ndarray, config: FitConfig
+) -> tuple[FitConfig, float | None]:
+    """Return the settings of a first frame with both numbers, and its time on the reference
+    machine in seconds, None if both were given.
 
     Args:
         views: V views, at least one.
@@ -81,8 +67,8 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
         config: settings of the fit.
     """
     if None not in (config.num_gaussians, config.first_frame_steps):
-        return Plan(config)
-    plan = with_num_gaussians(config, views, points)
+        return config, None
+    plan = config
     # Mean numbers of pixels of a view, and of one of half the size.
     pixels, half_pixels = (
         float(np.mean([view.camera.width * view.camera.height for view in some]))
@@ -100,8 +86,11 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
 
     if config.num_gaussians is None:
         # The most Gaussians that fit into the time, of those that the images ask for.
-        most = plan.planned_gaussians
-        least = min(max(plan.detail.least_gaussians, most // _LEAST_SHARE), most)
+        how = config.detail
+        details = sum(count_details(view.image, view.mask) for view in views)
+        count = how.per_detail * details / mean_views([view.camera for view in views], points)
+        most = int(np.clip(round(count), how.least_gaussians, how.most_gaussians))
+        least = min(max(how.least_gaussians, most // _LEAST_SHARE), most)
         too_many = bisect_left(
             range(least + 1, most + 1),
             True,
@@ -112,7 +101,7 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
         affordable = int(plan.planned_steps * config.first_frame_seconds / seconds(plan))
         steps = max(_LEAST_STEPS, min(plan.planned_steps, affordable))
         plan = replace(plan, first_frame_steps=steps)
-    return Plan(plan, seconds(plan))
+    return plan, seconds(plan)
 
 
 def _step_seconds(count: float, pixels: float) -> float:

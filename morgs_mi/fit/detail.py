@@ -1,4 +1,4 @@
-"""Detail and noise of images, and the number of Gaussians of the first frame that follows.
+"""Detail and noise of images, from which the number of Gaussians of the first frame follows.
 
 An image is averaged over blocks of 2x2 pixels, again and again. A value that differs from the mean
 of its block by more than a threshold and the noise is a detail. Flat areas and noise have none,
@@ -18,15 +18,11 @@ is the variance of white noise where there is nothing else, and no more than tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import unit_values
-from morgs_mi.core.rig import mean_views
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import View
 
 # A value of a block follows from its mean and the other three.
 _INDEPENDENT = 3 / 4
@@ -40,25 +36,6 @@ _FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 _MEDIAN = 0.6745
 # White noise from which images are noisy.
 _NOISY = 0.015
-
-
-def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndarray) -> FitConfig:
-    """Return the settings of a first frame with a number of Gaussians, which follows from the views
-    if none is given.
-
-    Args:
-        config: settings of the fit.
-        views: V views.
-        points: [P, 3] of the scene, world units, or none.
-    """
-    if config.num_gaussians is not None:
-        return config
-    how = config.detail
-    details = sum(count_details(view.image, view.mask) for view in views)
-    count = how.per_detail * details / mean_views([view.camera for view in views], points)
-    return replace(
-        config, num_gaussians=int(np.clip(round(count), how.least_gaussians, how.most_gaussians))
-    )
 
 
 def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:

@@ -195,7 +195,8 @@ def fit_confidence(
         image = rasterize(
             trial, cameras[view], ("confidence",), detach_weights=("confidence",), config=render
         )
-        return {"mask": mask_loss(image.confidence, targets[view])}
+        num_pixels = cameras[view].width * cameras[view].height
+        return {"mask": mask_loss(image.confidence, targets[view], num_pixels)}
 
     rates = {"logit_confidence": config.first_frame_rates.confidence}
     order = [views[k] for k in view_order(len(views), config.confidence_steps, rng)]

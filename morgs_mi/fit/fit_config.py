@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, Lt
 
 from morgs_mi.core.attributes import ATTRIBUTES
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import Count, NonNegative, NonNegativeInt, Positive, config_class
 from morgs_mi.method.objective import ObjectiveConfig
 
 # Epochs of a later frame before the learning rate of the means begins to decay.
@@ -30,19 +30,19 @@ class LearningRates:
     has under a hundred.
     """
 
-    means: Annotated[float, Ge(0)] = 5e-4
+    means: NonNegative = 5e-4
     """Learning rate of the means, motion and offset, in scene extents."""
-    scales: Annotated[float, Ge(0)] = 1e-2
+    scales: NonNegative = 1e-2
     """Learning rate of the logarithms of the scales."""
-    quats: Annotated[float, Ge(0)] = 1e-2
+    quats: NonNegative = 1e-2
     """Learning rate of the rotations."""
-    opacities: Annotated[float, Ge(0)] = 0.05
+    opacities: NonNegative = 0.05
     """Learning rate of the logits of the opacities."""
-    sh_dc: Annotated[float, Ge(0)] = 1e-2
+    sh_dc: NonNegative = 1e-2
     """Learning rate of the constant SH coefficient."""
-    sh_rest: Annotated[float, Ge(0)] = 5e-4
+    sh_rest: NonNegative = 5e-4
     """Learning rate of the other SH coefficients: a twentieth of the constant one's, as in 3DGS."""
-    confidence: Annotated[float, Ge(0)] = 0.05
+    confidence: NonNegative = 0.05
     """Learning rate of the logits of the confidence."""
 
     def by_parameter(self, extent: float) -> dict[str, float]:
@@ -61,19 +61,19 @@ class LearningRates:
 class DensityConfig:
     """Settings of density control (see `density`), with thresholds from the literature."""
 
-    rounds: Annotated[int, Ge(0)] = 6
+    rounds: NonNegativeInt = 6
     """Rounds of density control in the first frame; 0: none. With them, the first frame starts from
     half of its Gaussians and grows to all."""
     later_frames: bool = True
     """One round of density control in every later frame."""
-    births: Annotated[float, Ge(0)] = 0.02
+    births: NonNegative = 0.02
     """Largest number of births in a later frame, as a fraction of the Gaussians."""
-    max_gaussians: Annotated[int, Ge(1)] = 60_000
+    max_gaussians: Count = 60_000
     """Number of Gaussians beyond which a later frame adds none unless others are pruned."""
-    split_scale: Annotated[float, Ge(0)] = 0.01
+    split_scale: NonNegative = 0.01
     """Scale, in scene extents, above which the first frame splits a Gaussian instead of cloning it.
     """
-    min_error: Annotated[float, Ge(0)] = 0.1
+    min_error: NonNegative = 0.1
     """Attributed error, in pixels of full contrast, below which a later frame does not densify a
     Gaussian.
     """
@@ -85,11 +85,11 @@ class DensityConfig:
 class DetailConfig:
     """Settings of the number of Gaussians of the first frame where none is given (see `detail`)."""
 
-    per_detail: Annotated[float, Gt(0)] = 1.5
+    per_detail: Positive = 1.5
     """Gaussians per detail that the views do not share."""
-    least_gaussians: Annotated[int, Ge(1)] = 4_000
+    least_gaussians: Count = 4_000
     """Least number of Gaussians."""
-    most_gaussians: Annotated[int, Ge(1)] = 250_000
+    most_gaussians: Count = 250_000
     """Largest number of Gaussians, for memory, the time of later frames and the size of the stream.
     """
 
@@ -105,13 +105,13 @@ class DetailConfig:
 class CameraPriors:
     """Standard deviations of the errors of a calibration, under which its cameras are refined."""
 
-    rotation: Annotated[float, Gt(0)] = 0.5
+    rotation: Positive = 0.5
     """Rotation about each axis, degrees."""
-    position: Annotated[float, Gt(0)] = 0.005
+    position: Positive = 0.005
     """Position along each axis, in scene extents."""
-    focal: Annotated[float, Gt(0)] = 0.01
+    focal: Positive = 0.01
     """Focal lengths, relative."""
-    distortion: Annotated[float, Gt(0)] = 0.1
+    distortion: Positive = 0.1
     """First term of radial distortion that the calibrated lens leaves; the second has a fifth of
     this deviation.
     """
@@ -127,9 +127,9 @@ class ShortFitConfig:
     """Number of Gaussians."""
     steps: Annotated[int, Ge(2)] = 300
     """Steps of a fit; each further round takes half as many."""
-    rounds: Annotated[int, Ge(1)] = 5
+    rounds: Count = 5
     """Rounds of fitting Gaussians and changing the cameras."""
-    width: Annotated[int, Ge(1)] = 320
+    width: Count = 320
     """Least width to which images are reduced, px."""
 
 
@@ -139,16 +139,16 @@ class FitConfig:
 
     sh_degree: Annotated[int, Ge(0), Le(3)] = 1
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
-    num_gaussians: Annotated[int, Ge(1)] | None = None
+    num_gaussians: Count | None = None
     """Number of Gaussians of the first frame; None: from the detail of its images and its time (see
     `budget`). It starts from `first_count`."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """Number of Gaussians where none is given."""
-    first_frame_steps: Annotated[int, Ge(1)] | None = None
+    first_frame_steps: Count | None = None
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see
     `budget`).
     """
-    first_frame_seconds: Annotated[float, Gt(0)] = 120.0
+    first_frame_seconds: Positive = 120.0
     """Time that the first frame may take on two cores of a server: it limits those numbers of
     Gaussians and of steps that are not given."""
     dropout: Annotated[float, Ge(0), Lt(1)] | None = None
@@ -166,15 +166,15 @@ class FitConfig:
     are taken if withheld pixels show that they are real) or on (always taken)."""
     short_fits: ShortFitConfig = field(default_factory=ShortFitConfig)
     """Fits for the refinement of the cameras and for their exposures."""
-    confidence_steps: Annotated[int, Ge(0)] = 40
+    confidence_steps: NonNegativeInt = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
-    epochs: Annotated[int, Ge(1)] = 8
+    epochs: Count = 8
     """Most passes over all training views for every later frame; the paper's small variant takes 5.
     """
     skip_static: bool = True
     """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`).
     """
-    early_stopping_tolerance: Annotated[float, Ge(0)] = 1e-6
+    early_stopping_tolerance: NonNegative = 1e-6
     """Relative decrease of the objective over two epochs below which a later frame ends early; 0:
     never.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +24,6 @@ from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.objective import (
-    Observations,
     Prediction,
     channels_of,
     losses_of,
@@ -89,15 +89,86 @@ def fit_later_frame(
         progress: called with the numbers of steps made and of all steps.
     """
     active = problem.active
-    num_views = len(active.views)
-    if not num_views or not len(active.indices):
-        count = len(problem.previous)
-        return LaterFrame(at_rest(problem.previous), np.arange(count), {}, 0)
-    fit = _LaterFrameFit(problem, config, motion, rng, progress)
+    views = sorted(active.views)
+    count = len(views)
+    if not count or not len(active.indices):
+        source = np.arange(len(problem.previous))
+        return LaterFrame(at_rest(problem.previous), source, {}, 0)
+    progress = progress or Progress()
+    objective = config.objective
+    order = [views[k] for k in view_order(count, config.epochs * count, rng)]
+    # As tensors on the region of each active view.
+    observations: dict[int, dict[str, Any]] = {
+        v: {"target": problem.targets[v]}
+        | {
+            name: from_numpy(mi.TensorXf, view.crop(array))
+            for name, array in problem.observations.get(v, {}).items()
+        }
+        for v, view in active.views.items()
+    }
+    previous = active.select(problem.previous)
+    source = np.arange(len(active.indices))
+    scores: ErrorPerGaussian | None = None  # of the last epoch; None: no density control is to come
+    shared: dict[str, Neighbours] = {}  # observations of all views
+    awaits_density_round = config.density.later_frames
+
+    def steps_of(epoch: int, epochs: int = 1) -> Steps:
+        """Return the steps of some epochs, one in every active view per epoch."""
+        return Steps(
+            order[epoch * count : (epoch + epochs) * count],
+            epoch * count,
+            on_step=lambda step: progress(step, len(order)),
+            observer=scores,
+            averaged_steps=count,
+        )
+
+    def gaussians() -> Gaussians:
+        """Return the active Gaussians after the residual."""
+        with dr.suspend_grad():
+            return apply_residual(previous, values_of(optimizer), motion)
+
+    def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
+        """Render one view and return its losses by name."""
+        view = active.views[index]
+        observed = {**observations[index], **shared}
+        channels = channels_of(observed, objective)
+        gaussians = apply_residual(previous, parameters, motion)
+        features = None if scores is None else scores.features()
+        # Motion, confidence and scores must not move opacity and geometry.
+        names = channels if features is None else (*channels, "features")
+        detached_channels = [name for name in names if name != "color"]
+        image = view.render(gaussians, channels, detached_channels, features)
+        if scores is not None and features is not None:
+            scores.observe(image, problem.targets[index], view.region)
+        prediction = Prediction(
+            image,
+            parameters,
+            view.region,
+            view.camera.width * view.camera.height,
+            active.num_gaussians,
+            problem.extent,
+            gaussians,
+        )
+        return losses_of(prediction, observed, objective)
+
+    start = problem.start
+    losses = dict[str, float]()
+    epochs = 0
+    factory = MOTION_MODELS.make(motion.model, motion)
+    if factory is not None:
+        epochs = max(1, round(motion.model_share * config.epochs))
+        model = factory(previous, problem.extent, rng)
+        steps = steps_of(0, epochs)
+        start, losses = _fit_motion(previous, problem, model, start, steps, objective.dssim_weight)
+    optimizer = adam(residual_parameters(previous, motion, start), config.momentum)
+    weights = weights_of(objective)
+    has_neighbours = any(
+        "neighbours" in term.observations for term in terms_of(objective) if weights[term.name]
+    )
     latest_density_epoch = round(_LATEST_DENSITY_ROUND * config.epochs)
     tolerance = config.early_stopping_tolerance
     objectives = []
-    for epoch in range(fit.steps // num_views, config.epochs):
+    while epochs < config.epochs:
         # It may rise in a single epoch.
         has_converged = (
             tolerance > 0
@@ -105,154 +176,32 @@ def fit_later_frame(
             and objectives[-1] > (1 - tolerance) * objectives[-3]
         )
         # An epoch has shown where to add Gaussians.
-        if fit.scores is not None and (has_converged or epoch >= latest_density_epoch):
-            fit.densify()
+        if scores is not None and (has_converged or epochs >= latest_density_epoch):
+            num_static = len(problem.previous) - len(active.indices)
+            errors = np.asarray(scores.scores)
+            plan = plan_additions(gaussians(), errors, config.density, rng, num_static)
+            # The optimiser has the residual, so the plan changes the previous Gaussians: a birth
+            # starts from the past of its parent, and shares its residual.
+            previous = apply_plan(previous, plan)
+            source = plan.source
+            select_rows(optimizer, plan.parent, plan.source < 0)
+            shared = {}
+            scores = None
+            awaits_density_round = False
         elif has_converged:
             break
-        objectives.append(fit.run_epoch(epoch))
-    gaussians, source = active.merge(problem.previous, fit.gaussians(), fit.source)
-    return LaterFrame(gaussians, source, fit.losses, fit.steps // num_views)
-
-
-class _LaterFrameFit:
-    """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of
-    density control. An epoch is a step in every active view.
-
-    Attributes:
-        source: as in `LaterFrame`, among the active Gaussians.
-        losses: mean losses of the last epoch, by name.
-        steps: number of steps that were made.
-        scores: of the last epoch, for the round of density control; None where none is to come.
-    """
-
-    def __init__(
-        self,
-        problem: FrameProblem,
-        config: FitConfig,
-        motion: MotionConfig,
-        rng: np.random.Generator,
-        progress: Progress | None,
-    ) -> None:
-        self._problem = problem
-        self._config = config
-        self._motion = motion
-        self._rng = rng
-        self._progress = progress or Progress()
-        active = problem.active
-        views = sorted(active.views)
-        count = len(views)
-        self._order = [views[k] for k in view_order(count, config.epochs * count, rng)]
-        # As tensors on the region of each active view.
-        self._observations: dict[int, Observations] = {
-            v: {"target": problem.targets[v]}
-            | {
-                name: from_numpy(mi.TensorXf, view.crop(array))
-                for name, array in problem.observations.get(v, {}).items()
-            }
-            for v, view in active.views.items()
-        }
-        self._previous = active.select(problem.previous)
-        self._neighbours: Neighbours | None = None
-        self._awaits_density_round = config.density.later_frames
-        self.source = np.arange(len(active.indices))
-        self.scores: ErrorPerGaussian | None = None
-        self.losses = dict[str, float]()
-        self.steps = 0
-        start = problem.start
-        factory = MOTION_MODELS.make(motion.model, motion)
-        if factory is not None:
-            epochs = max(1, round(motion.model_share * config.epochs))
-            start, self.losses = _fit_motion(
-                self._previous,
-                problem,
-                factory(self._previous, problem.extent, rng),
-                start,
-                self._next_steps(epochs * count),
-                config.objective.dssim_weight,
-            )
-        parameters = residual_parameters(self._previous, motion, start)
-        self._optimizer = adam(parameters, config.momentum)
-
-    def gaussians(self) -> Gaussians:
-        """Return the active Gaussians after the residual."""
-        with dr.suspend_grad():
-            return apply_residual(self._previous, values_of(self._optimizer), self._motion)
-
-    def run_epoch(self, number: int) -> float:
-        """Make one step in every active view, at the rates of epoch `number`, and return the
-        objective (eq. 13).
-        """
-        config = self._config
-        num_views = len(self._problem.active.views)
-        if self._awaits_density_round:
+        if awaits_density_round:
             # Scores are collected in the last quarter: an error that is seen earlier may be gone by
             # the end of the epoch.
-            self.scores = ErrorPerGaussian(len(self.source), num_views - (num_views + 3) // 4)
-        weights = weights_of(config.objective)
-        terms = [term for term in terms_of(config.objective) if weights[term.name]]
-        if self._neighbours is None and any("neighbours" in term.observations for term in terms):
-            self._neighbours = find_neighbours(self._previous, self._problem.extent)
-        rates = config.rates_at(number).by_parameter(self._problem.extent)
-        steps = self._next_steps(num_views)
-        self.losses = optimise(self._optimizer, rates, self._losses_at, steps, weights)
-        return sum(weights[name] * loss for name, loss in self.losses.items())
-
-    def densify(self) -> None:
-        """Add and prune active Gaussians by density control, once."""
-        assert self.scores is not None
-        problem = self._problem
-        num_static = len(problem.previous) - len(problem.active.indices)
-        plan = plan_additions(
-            self.gaussians(),
-            np.asarray(self.scores.scores),
-            self._config.density,
-            self._rng,
-            num_static,
-        )
-        # The optimiser has the residual, so the plan changes the previous Gaussians: a birth starts
-        # from the past of its parent, and shares its residual.
-        self._previous = apply_plan(self._previous, plan)
-        self.source = plan.source
-        select_rows(self._optimizer, plan.parent, plan.source < 0)
-        self._neighbours = None
-        self._awaits_density_round = False
-        self.scores = None
-
-    def _next_steps(self, count: int) -> Steps:
-        """Return the next steps, which collect densification scores, if any, and count them."""
-        first = self.steps
-        self.steps += count
-        return Steps(
-            views=self._order[first : self.steps],
-            first_step=first,
-            on_step=lambda step: self._progress(step, len(self._order)),
-            observer=self.scores,
-            averaged_steps=len(self._problem.active.views),
-        )
-
-    def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
-        """Render one view and return its losses by name."""
-        problem = self._problem
-        objective = self._config.objective
-        view = problem.active.views[index]
-        observations = dict(self._observations[index])
-        if self._neighbours is not None:
-            observations["neighbours"] = self._neighbours
-        channels = channels_of(observations, objective)
-        gaussians = apply_residual(self._previous, parameters, self._motion)
-        features = None if self.scores is None else self.scores.features()
-        # Motion, confidence and scores must not move opacity and geometry.
-        names = channels if features is None else (*channels, "features")
-        detached_channels = [name for name in names if name != "color"]
-        image = view.render(gaussians, channels, detached_channels, features)
-        if self.scores is not None and features is not None:
-            self.scores.observe(image, problem.targets[index], view.region)
-        num_pixels = view.camera.width * view.camera.height
-        num_gaussians = problem.active.num_gaussians
-        prediction = Prediction(
-            image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians
-        )
-        return losses_of(prediction, observations, objective)
+            scores = ErrorPerGaussian(len(source), count - (count + 3) // 4)
+        if has_neighbours and not shared and len(previous) > 1:
+            shared = {"neighbours": find_neighbours(previous, problem.extent)}
+        rates = config.rates_at(epochs).by_parameter(problem.extent)
+        losses = optimise(optimizer, rates, losses_at, steps_of(epochs), weights)
+        objectives.append(sum(weights[name] * loss for name, loss in losses.items()))
+        epochs += 1
+    result, source = active.merge(problem.previous, gaussians(), source)
+    return LaterFrame(result, source, losses, epochs)
 
 
 def _fit_motion(

@@ -22,7 +22,7 @@ from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.loop.frame_report import FittedFrame
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.observation import FrameObservation, Images, Setup, views_of
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
@@ -36,8 +36,8 @@ def fitted_first_frame(
     observed: FrameObservation,
     progress: Progress,
     on_provisional: Callable[[Packet], None] | None,
-) -> FittedFrame:
-    """Return the fit of the first frame.
+) -> tuple[Packet, FrameReport]:
+    """Return the keyframe of the first frame, and the report of its fit.
 
     Args:
         setup: data that all frames share.
@@ -49,10 +49,10 @@ def fitted_first_frame(
     exposures, exposure_entry = _balanced(setup, observed.encoded, progress)
     views = views_of(setup, corrected(observed.encoded, exposures))
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
-    plan = plan_first_frame(views, setup.points, config.fit)
+    plan, seconds = plan_first_frame(views, setup.points, config.fit)
     cloud = setup.points, setup.point_colors
-    problem = FirstFrameProblem.of(views, cloud, plan.config, config.render, rng)
-    fit_config = adapted_to_images(plan.config, problem)
+    problem = FirstFrameProblem.of(views, cloud, plan, config.render, rng)
+    fit_config = adapted_to_images(plan, problem)
 
     packet_of = partial(keyframe_packet, frame=0, cameras=setup.cameras, config=config.codec)
     on_round = None
@@ -61,7 +61,7 @@ def fitted_first_frame(
     status = "ok"
     if (count := len(setup.points)) < MIN_POINTS:
         status = (
-            f"the capture has {count} points, too few: seeded {plan.config.first_count} random "
+            f"the capture has {count} points, too few: seeded {plan.first_count} random "
             "ones inside the views"
         )
         _LOG.warning("frame 0: %s", status)
@@ -70,15 +70,21 @@ def fitted_first_frame(
         expected = forecast(problem.cameras, problem.points)
         quality = {"sentence": expected.sentence, "quality": expected.quality}
         validation = {**quality, **asdict(expected), **exposure_entry}
-    fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
-    return FittedFrame(
-        packet=packet_of(fitted.gaussians),
-        exposures=exposures,
+    stage = "First frame" + ("" if seconds is None else f", about {max(seconds, 1):.0f} s")
+    fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round)
+    packet = packet_of(fitted.gaussians)
+    report = FrameReport(
+        frame=0,
+        seconds=0.0,
+        num_bytes=packet.num_bytes,
         losses=fitted.losses,
-        steps=fitted.steps,
+        num_gaussians=len(fitted.gaussians),
         status=status,
         validation=validation,
+        steps=fitted.steps,
+        exposures=exposures,
     )
+    return packet, report
 
 
 def _balanced(

@@ -1,11 +1,10 @@
-"""Report of a frame, and the result of its fit, from which the loop makes the report."""
+"""Report of a frame."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
 
-from morgs_mi.codec.container import Packet
 from morgs_mi.method.exposure import Exposure
 
 
@@ -50,18 +49,3 @@ class FrameReport:
     def __repr__(self) -> str:
         size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"
         return f"FrameReport(frame {self.frame}, {size}, {self.status})"
-
-
-@dataclass(frozen=True)
-class FittedFrame:
-    """Result of the fit of a frame: its packet, and entries of its `FrameReport`."""
-
-    packet: Packet
-    #: Exposures of all views in the first frame, relative to the scene; empty if they are not
-    #: estimated.
-    exposures: tuple[Exposure, ...]
-    losses: dict[str, float]
-    steps: int
-    status: str
-    active: dict[str, float] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)

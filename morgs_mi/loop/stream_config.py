@@ -17,12 +17,10 @@ preset. `core.config` reads settings from TOML files and writes them.
 from __future__ import annotations
 
 from dataclasses import field
-from typing import Annotated, Any, Literal
-
-from annotated_types import Ge
+from typing import Any, Literal
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.core.config import apply_values, config_class
+from morgs_mi.core.config import NonNegativeInt, apply_values, config_class
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
@@ -46,7 +44,7 @@ class StreamConfig:
     """Rasteriser."""
     codec: CodecConfig = field(default_factory=CodecConfig)
     """Precision and size of the stream."""
-    seed: Annotated[int, Ge(0)] = 0
+    seed: NonNegativeInt = 0
     """Seed of every random choice: order of the views, added points."""
 
 

@@ -18,15 +18,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import Annotated
 
 import cv2
 import mitsuba as mi
 import numpy as np
-from annotated_types import Ge
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import Count, NonNegative, config_class
 from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.rig import choose_key_views
@@ -57,13 +55,13 @@ QUIET = 0.2
 class ActiveSetConfig:
     """Settings of the selection, see the module."""
 
-    min_responsibility: Annotated[float, Ge(0)] = 0.05
+    min_responsibility: NonNegative = 0.05
     """Responsibility above which a Gaussian is active."""
-    min_weight: Annotated[float, Ge(0)] = 0.2
+    min_weight: NonNegative = 0.2
     """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
     hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
     later."""
-    quiet_views: Annotated[int, Ge(1)] = 12
+    quiet_views: Count = 12
     """Number of views in which active Gaussians that hardly change are rendered."""
 
 
@@ -137,7 +135,7 @@ def find_active_set(
     changes: Mapping[int, np.ndarray] | None,
     channels: Mapping[int, Sequence[str]],
     render: RenderConfig,
-    config: ActiveSetConfig | None = None,
+    config: ActiveSetConfig,
 ) -> ActiveSet:
     """Return the active set of a frame (see the module).
 
@@ -150,7 +148,6 @@ def find_active_set(
         render: cut-offs.
         config: settings.
     """
-    config = config or ActiveSetConfig()
     if changes is None or sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
         return full_active_set(gaussians, cameras, render)
     changed_views = {
@@ -178,7 +175,7 @@ def find_active_set(
     static = at_rest(gaussians.select(~active))
     views = {
         v: make_active_view(
-            cameras[v], Region.of(changed_views[v].view.grid, blocks), static, channels[v], render
+            cameras[v], Region(changed_views[v].view.grid, blocks), static, channels[v], render
         )
         for v, blocks in blocks_by_view.items()
         if blocks.any()

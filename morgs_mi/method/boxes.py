@@ -11,6 +11,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Float, UInt32
+from morgs_mi.render.backend import elements
 from morgs_mi.render.projection import project
 from morgs_mi.render.region import BlockGrid
 from morgs_mi.render.render_config import RenderConfig
@@ -52,8 +53,7 @@ class Boxes:
             place = j * dr.opaque(mi.UInt32, columns + 1) + i
             pitch = dr.opaque(mi.UInt32, columns + 1)
             a, b, c, d = (
-                mi.Float(dr.gather(mi.UInt32, table, place + step))
-                for step in (0, 1, pitch, pitch + 1)
+                mi.Float(elements(table, place + step)) for step in (0, 1, pitch, pitch + 1)
             )
             u = dr.minimum(across - mi.Float(i), 1)
             v = dr.minimum(down - mi.Float(j), 1)

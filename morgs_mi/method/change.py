@@ -18,13 +18,10 @@ so it counts once it has grown.
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import cv2
 import numpy as np
-from annotated_types import Ge
 
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import NonNegative, config_class
 
 # Of 1; also the least threshold, and the bound of the noise of the whole image.
 _GREY_LEVEL = 1 / 255
@@ -48,11 +45,11 @@ _COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 class ChangeConfig:
     """Settings of the change detection."""
 
-    sigmas: Annotated[float, Ge(0)] = 5.0
+    sigmas: NonNegative = 5.0
     """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4
     million pixels.
     """
-    min_peak: Annotated[float, Ge(0)] = 4 * _GREY_LEVEL
+    min_peak: NonNegative = 4 * _GREY_LEVEL
     """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0:
     none. Blocks of compressed video change by less."""
 
@@ -60,8 +57,8 @@ class ChangeConfig:
 def change_mask(
     reference: np.ndarray,
     image: np.ndarray,
-    valid: np.ndarray | None = None,
-    config: ChangeConfig | None = None,
+    valid: np.ndarray | None,
+    config: ChangeConfig,
 ) -> np.ndarray:
     """Return the mask of changed pixels [H, W], bool.
 
@@ -71,7 +68,6 @@ def change_mask(
         valid: [H, W] bool, pixels that count; None: all.
         config: settings.
     """
-    config = config or ChangeConfig()
     H, W = reference.shape[:2]
     if reference.dtype == np.uint8 and image.dtype == np.uint8:  # large images: in integers
         difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)

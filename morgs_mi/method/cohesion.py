@@ -76,7 +76,7 @@ def share_confidence(
     logit: np.ndarray,
     still: float,
     weight: float,
-    neighbours: NeighbourIndex | None = None,
+    neighbours: NeighbourIndex,
 ) -> np.ndarray:
     """Return the logits z [M] of the chosen Gaussians (see the module).
 
@@ -86,9 +86,8 @@ def share_confidence(
         logit: u [M], their own logits.
         still: logit of all others.
         weight: lambda, of an opaque neighbour of the same colour; 0: no cohesion.
-        neighbours: index of all means; None: it is built.
+        neighbours: index of all means.
     """
-    neighbours = neighbours or NeighbourIndex(np.asarray(gaussians.means))
     near = neighbours.nearest(_NEIGHBOURS, indices)
     if not near.size:
         return logit

@@ -21,6 +21,7 @@ from morgs_mi.core.types import Tensor
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import KeyImages
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.backend import elements
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
@@ -74,7 +75,7 @@ class ErrorPerGaussian:
         color = dr.detach(image.color).array
         difference = dr.abs(pixels - (color if weight is None else color * weight))
         pixel = dr.arange(mi.UInt32, dr.width(difference) // 3) * 3
-        error = sum(dr.gather(mi.Float, difference, pixel + c) for c in range(3)) / 3
+        error = sum(elements(difference, pixel + c) for c in range(3)) / 3
         # About the median of the errors that are not 0: the mean of those below twice the mean.
         mean = dr.sum(error) / dr.maximum(mi.Float(dr.count(error > 0)), 1)
         small = (error > 0) & (error < 2 * mean)

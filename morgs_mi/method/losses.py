@@ -11,11 +11,12 @@ import mitsuba as mi
 
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.ssim import Recon, Target
+from morgs_mi.render.backend import elements
 from morgs_mi.render.region import Region
 
 
 def recon_loss(
-    image: Tensor, target: Target, dssim_weight: float = 0.2, region: Region | None = None
+    image: Tensor, target: Target, dssim_weight: float, region: Region | None = None
 ) -> Tensor:
     """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image`.
 
@@ -33,9 +34,7 @@ def recon_loss(
     return dr.custom(Recon, image.array, target, dssim_weight, part)
 
 
-def flow_loss(
-    motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int | None = None
-) -> Tensor:
+def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int) -> Tensor:
     """Return the mean endpoint error in px between the rendered motion map and the observed motion
     (eq. 7).
 
@@ -44,35 +43,33 @@ def flow_loss(
         target: motion by optical flow on the same grid, of the same shape and sign, px.
         reliable: [H, W] of 0 and 1, or on the region. The mean is over all pixels: few reliable
             pixels weigh little.
-        num_pixels: of the whole view; None: those given.
+        num_pixels: of the whole view.
     """
     lane = dr.arange(mi.UInt32, dr.width(motion) // 2) * 2
     x, y = (
         dr.gather(mi.Float, motion.array, lane + k, mode=dr.ReduceMode.NoConflicts)
-        - dr.gather(mi.Float, target.array, lane + k)
+        - elements(target.array, lane + k)
         for k in range(2)
     )
     # A hundredth of a pixel keeps the derivative finite where both agree.
     total = dr.sum(dr.sqrt(x * x + y * y + 1e-4) * reliable.array)
-    return total * dr.opaque(mi.Float, 1 / (num_pixels or dr.width(reliable)))
+    return total * dr.opaque(mi.Float, 1 / num_pixels)
 
 
-def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int | None = None) -> Tensor:
+def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int) -> Tensor:
     """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W]
     (eq. 11), as `flow_loss`.
     """
     total = dr.sum(dr.abs(confidence.array - mask.array))
-    return total * dr.opaque(mi.Float, 1 / (num_pixels or dr.width(mask)))
+    return total * dr.opaque(mi.Float, 1 / num_pixels)
 
 
-def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None) -> Tensor:
+def offset_loss(offset: Tensor, extent: float, num_gaussians: int) -> Tensor:
     """Return the mean L1 norm of the offsets [N, 3] in scene extents (L_off).
 
     Args:
         offset: offsets of the active Gaussians, world units.
         extent: of the scene, world units.
-        num_gaussians: of the whole scene; None: those given.
+        num_gaussians: of the whole scene.
     """
-    return dr.sum(dr.abs(offset.array)) * dr.opaque(
-        mi.Float, 1 / ((num_gaussians or int(offset.shape[0])) * extent)
-    )
+    return dr.sum(dr.abs(offset.array)) * dr.opaque(mi.Float, 1 / (num_gaussians * extent))

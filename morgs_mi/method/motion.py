@@ -14,7 +14,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.active_set import ActiveSet
-from morgs_mi.method.cohesion import share_confidence
+from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import MAX_LOGIT, lift_flow
 from morgs_mi.method.motion_config import MotionConfig
@@ -73,7 +73,9 @@ def initial_motion(
     if gaussians.logit_confidence is not None:
         last_logit = np.asarray(gaussians.logit_confidence)
         logit = np.maximum(logit, last_logit - np.float32(_CONFIDENCE_DECAY))
-    neighbours = problem.neighbours if gaussians is previous else None
+    neighbours = problem.neighbours
+    if gaussians is not previous:
+        neighbours = NeighbourIndex(np.asarray(previous.means))
     shared = share_confidence(
         previous, active.indices, logit, -MAX_LOGIT, config.cohesion_weight, neighbours
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import Count, NonNegative, config_class
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig
@@ -59,11 +59,11 @@ class MotionConfig:
     mask_method: str = "grabcut"
     """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
     sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
-    key_views: Annotated[int, Ge(1)] = 4
+    key_views: Count = 4
     """Number of cameras with optical flow and masks."""
-    mask_interval: Annotated[int, Ge(1)] = 5
+    mask_interval: Count = 5
     """Frames from one supervision of the confidence by masks to the next."""
-    cohesion_weight: Annotated[float, Ge(0)] = 50.0
+    cohesion_weight: NonNegative = 50.0
     """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian
     alone (see `cohesion`); 0: no cohesion."""
     model: str = "none"

@@ -22,7 +22,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from morgs_mi.core.checks import check_number
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import NonNegative, config_class
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.flow import FlowObservation
@@ -47,17 +47,17 @@ class ObjectiveConfig:
 
     dssim_weight: Annotated[float, Ge(0), Le(1)] = 0.2
     """lambda of eq. 2."""
-    flow_weight: Annotated[float, Ge(0)] = 0.01
+    flow_weight: NonNegative = 0.01
     """lambda_flow of eq. 13, per px of endpoint error."""
-    mask_weight: Annotated[float, Ge(0)] = 0.5
+    mask_weight: NonNegative = 0.5
     """lambda_mask of eq. 13."""
-    offset_weight: Annotated[float, Ge(0)] = 0.01
+    offset_weight: NonNegative = 0.01
     """lambda_off of eq. 13, per scene extent."""
-    rigid_weight: Annotated[float, Ge(0)] = 0.0
+    rigid_weight: NonNegative = 0.0
     """Weight of the local rigidity (see `rigidity`), per scene extent."""
-    rotation_weight: Annotated[float, Ge(0)] = 0.0
+    rotation_weight: NonNegative = 0.0
     """Weight of the similarity of rotations there."""
-    isometry_weight: Annotated[float, Ge(0)] = 0.0
+    isometry_weight: NonNegative = 0.0
     """Weight of the isometry there, per scene extent."""
     terms: tuple[str, ...] = ()
     """Registered terms, NAME:WEIGHT each (see docs/extending.md)."""

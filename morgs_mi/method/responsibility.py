@@ -83,7 +83,7 @@ def responsibility(
         h, w = (max(size // factor, 1) for size in changed_view.change.shape)
         change = changed_view.change.astype(np.float32)
         share = cv2.resize(change, (w, h), interpolation=cv2.INTER_AREA)
-        region = Region(share > 0, view.config)
+        region = Region.of(share > 0, view.config)
         near += boxes.within(region.block_table, region.grid, factor)
         views_with_changes.append(ActiveView(view.camera.resized(w, h), view.config, region))
         shares.append(share)

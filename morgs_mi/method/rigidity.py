@@ -48,9 +48,8 @@ class Neighbours:
 
 def find_neighbours(
     gaussians: Gaussians, extent: float, count: int = _NEIGHBOURS, reach: float = _REACH
-) -> Neighbours | None:
-    """Return the pairs of neighbours among N Gaussians of the previous frame, None if there is only
-    one Gaussian.
+) -> Neighbours:
+    """Return the pairs of neighbours among N > 1 Gaussians of the previous frame.
 
     Args:
         gaussians: the N Gaussians.
@@ -59,8 +58,6 @@ def find_neighbours(
         reach: distance s at which the weight of a neighbour has fallen to 0.37, in scene extents.
     """
     means = np.asarray(gaussians.means)
-    if len(means) < 2:
-        return None
     near = NeighbourIndex(means).nearest(count)
     N, k = near.shape
     first = _selection(np.repeat(np.arange(N), k), N)

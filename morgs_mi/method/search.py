@@ -21,14 +21,14 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from annotated_types import Ge, Gt, Le
+from annotated_types import Gt, Le
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import NonNegativeInt, config_class
 from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
@@ -56,13 +56,11 @@ class SearchConfig:
 
     reach: Annotated[float, Gt(0), Le(1)] = 0.1
     """Longest displacement along each axis, as a fraction of the image width."""
-    max_parts: Annotated[int, Ge(0)] = 3
+    max_parts: NonNegativeInt = 3
     """Most parts of a frame, those with the largest errors first."""
 
 
-def search_motion(
-    problem: MotionProblem, start: MotionStart, config: SearchConfig | None = None
-) -> MotionStart:
+def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConfig) -> MotionStart:
     """Return a start of the motion in which parts that were not explained move to where they are
     found.
 
@@ -73,7 +71,6 @@ def search_motion(
         start: of the motion.
         config: settings.
     """
-    config = config or SearchConfig()
     if not problem.views:
         return start
     displacement = start.displacement

@@ -41,7 +41,7 @@ from morgs_mi.method.ssim_layout import (
     read_packet,
     write_packet,
 )
-from morgs_mi.render.backend import on_aligned_stack
+from morgs_mi.render.backend import elements, on_aligned_stack
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.region import Region
 
@@ -116,7 +116,7 @@ class Target:
                 self.pixels
             ), None if self.weight is None else self.planes.image(self.weight)
         places, valid = self.places_on(region)
-        weight = None if self.weight is None else dr.gather(mi.Float, self.weight, places)
+        weight = None if self.weight is None else elements(self.weight, places)
         return dr.gather(mi.Float, self.pixels, places, active=valid), weight
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
@@ -143,9 +143,7 @@ class Target:
         """Return planes, or their numbers at `places`, set to 0 where the mask is False."""
         if self.weight is None:
             return values
-        return values * (
-            self.weight if places is None else dr.gather(mi.Float, self.weight, places)
-        )
+        return values * (self.weight if places is None else elements(self.weight, places))
 
 
 class Recon(dr.CustomOp):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import drjit as dr
@@ -18,7 +19,8 @@ import numpy as np
 
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, UInt32
-from morgs_mi.render.region import Region, quotient
+from morgs_mi.render.backend import elements
+from morgs_mi.render.region import Region, quotient_and_rest
 
 RADIUS = 5
 STRIP = 8  # pixels wide: a window extends at most into the next strip
@@ -69,10 +71,8 @@ class Planes:
         lane = dr.arange(mi.UInt32, self.size)
         line = lane // (COLUMN * STRIP)
         x = lane % (COLUMN * STRIP)
-        column = quotient(line, self.height)
-        y = line - column * dr.opaque(mi.UInt32, self.height)
-        component = quotient(column, self.num_columns)
-        column -= component * dr.opaque(mi.UInt32, self.num_columns)
+        column, y = quotient_and_rest(line, self.height)
+        component, column = quotient_and_rest(column, self.num_columns)
         x += column * (COLUMN * STRIP) - _SPARE * STRIP
         width = dr.opaque(mi.UInt32, self.width)
         return dr.gather(mi.Float, image, (y * width + x) * 3 + component, active=x < width)
@@ -90,17 +90,15 @@ class Planes:
             return target
         lane = dr.arange(mi.UInt32, 3 * self.height * self.width)
         pixel = lane // 3
-        y = quotient(pixel, self.width)
-        place = self._place(lane - 3 * pixel, y, pixel - y * dr.opaque(mi.UInt32, self.width))
-        return dr.gather(mi.Float, planes, place)
+        y, x = quotient_and_rest(pixel, self.width)
+        return elements(planes, self._place(lane - 3 * pixel, y, x))
 
     def _strips(self, count: int, first: int = 0) -> tuple[UInt32, UInt32, list[UInt32]]:
         """Return (strip, row) of `count` strips of every row, and the place of strip `first` +
         strip in each plane.
         """
         lane = dr.arange(mi.UInt32, self.height * count)
-        y = quotient(lane, count)
-        strip = lane - y * dr.opaque(mi.UInt32, count)
+        y, strip = quotient_and_rest(lane, count)
         x = (strip + first) * STRIP - _SPARE * STRIP
         return (
             strip,
@@ -108,14 +106,15 @@ class Planes:
             [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)],
         )
 
-    def _place(self, component: UInt32, y: UInt32, x: UInt32) -> UInt32:
-        return _place(
-            component,
-            y,
-            x,
-            dr.opaque(mi.UInt32, self.height),
-            dr.opaque(mi.UInt32, self.num_columns),
-        )
+    def _place(self, component: Jit, y: Jit, x: Jit) -> Jit:
+        """Return the place of a number; all arguments are integers, NumPy's or Dr.Jit's."""
+        sizes: Any = self.height, self.num_columns
+        if dr.is_jit_v(x):
+            sizes = (dr.opaque(mi.UInt32, size) for size in sizes)
+        height, num_columns = sizes
+        x = x + _SPARE * STRIP
+        column = component * num_columns + x // (COLUMN * STRIP)
+        return (column * height + y) * (COLUMN * STRIP) + x % (COLUMN * STRIP)
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
         """Return the places of the numbers of a flat image on a region, and the mask of those in
@@ -140,10 +139,7 @@ class Planes:
             for v, size in ((x, self.width), (y, self.height))
         )
         near = [
-            [
-                dr.gather(mi.Float, planes, self._place(component, mi.UInt32(b), mi.UInt32(a)))
-                for a in xs
-            ]
+            [elements(planes, self._place(component, mi.UInt32(b), mi.UInt32(a))) for a in xs]
             for b in ys
         ]
         along_x, along_y = (
@@ -190,10 +186,7 @@ class Planes:
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP  # strip 1 is the first of the image
         left, middle, right = (
-            from_numpy(
-                mi.UInt32,
-                _place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP,
-            )
+            from_numpy(mi.UInt32, self._place(component, 0, x + k * STRIP) // STRIP)
             for k in (-1, 0, 1)
         )
         lanes = Lanes(
@@ -222,10 +215,3 @@ def packet_type() -> type[Jit]:
     size.
     """
     return sys.modules[mi.Float.__module__].ArrayXf
-
-
-def _place(component: Jit, y: Jit, x: Jit, height: Jit, num_columns: Jit) -> Jit:
-    """Return the place of a number; all arguments are integers, NumPy's or Dr.Jit's."""
-    x = x + _SPARE * STRIP
-    column = component * num_columns + x // (COLUMN * STRIP)
-    return (column * height + y) * (COLUMN * STRIP) + x % (COLUMN * STRIP)

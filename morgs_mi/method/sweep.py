@@ -23,6 +23,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Float
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.backend import elements
 from morgs_mi.render.projection import concatenated
 from morgs_mi.render.view_group import Drawing, ViewGroup
 
@@ -81,8 +82,7 @@ class KeyImages:
             gradient = self._gradient if {"normal", "right"} & set(names) else (error, error)
             lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
             pixel = [
-                [dr.gather(mi.Float, values, 3 * lane + c) for c in range(3)]
-                for values in (error, *gradient)
+                [elements(values, 3 * lane + c) for c in range(3)] for values in (error, *gradient)
             ]
             columns = [MAPS[name](*pixel) for name in names]
             *ends, count = np.cumsum([len(column) for column in columns]).tolist()

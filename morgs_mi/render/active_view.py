@@ -66,7 +66,7 @@ class ActiveView:
         there are none.
         """
         blocks = blocks if self.region is None else blocks & self.region.drawn
-        return replace(self, region=Region.of(self.grid, blocks)) if blocks.any() else None
+        return replace(self, region=Region(self.grid, blocks)) if blocks.any() else None
 
 
 def make_active_view(

@@ -9,7 +9,7 @@ from math import log
 import drjit as dr
 import mitsuba as mi
 
-from morgs_mi.core.types import Float, Int32, UInt32
+from morgs_mi.core.types import Float, Int32, Jit, UInt32
 from morgs_mi.render.render_config import RenderConfig
 
 # Minimax over [-1/2, 1/2], highest power first: relative error 2.7e-6 in float32, like Taylor's
@@ -35,6 +35,11 @@ def block_shape(config: RenderConfig) -> tuple[int, int]:
     """
     default_width = 8 if on_cpu() else 4
     return config.block_width or default_width, config.block_height or 4
+
+
+def elements(values: Jit, places: UInt32) -> Jit:
+    """Return the elements of an array at some places."""
+    return dr.gather(type(values), values, places)
 
 
 def stable_order(keys: UInt32, buckets: int) -> UInt32:

@@ -20,10 +20,10 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Bool, Float, UInt32
-from morgs_mi.render.backend import stable_order
+from morgs_mi.render.backend import elements, stable_order
 from morgs_mi.render.cut import FARTHEST_CUT
 from morgs_mi.render.projection import Splats
-from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, on_region, quotient
+from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, on_region, quotient_and_rest
 from morgs_mi.render.render_config import RenderConfig
 
 # A thousandth of an octave: the block test may accept too many entries, never too few.
@@ -80,7 +80,7 @@ def build_lists(
     (x0, y0, x1, _), counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
     rectangles = [x0, y0, x1 - x0, dr.select(splats.valid, counts, 0)]
     dr.eval(rectangles)
-    tiles = _tile_lists([dr.gather(mi.UInt32, v, by_depth_order) for v in rectangles], region)
+    tiles = _tile_lists([elements(v, by_depth_order) for v in rectangles], region)
 
     records = pack_records([*splats.geometry, *columns], by_depth_order)
     geometry = fetch_record(
@@ -88,9 +88,9 @@ def build_lists(
     )
     farthest = None if limits is None else _farthest_limits(limits, region)
     words, first_word, end_word = _block_bits(geometry, tiles, region, config, farthest)
-    begin = dr.gather(mi.UInt32, first_word, region.tile) * 32 + region.bit
-    end = dr.gather(mi.UInt32, end_word, region.tile) * 32 + region.bit
-    first = dr.gather(mi.UInt32, tiles.first, region.tile)
+    begin = elements(first_word, region.tile) * 32 + region.bit
+    end = elements(end_word, region.tile) * 32 + region.bit
+    first = elements(tiles.first, region.tile)
     count = _set_bits(words, begin, end)
     dr.eval(begin, end, first, count)
     # Neighbours stay together if their lengths differ by less than an eighth: they draw the same
@@ -127,7 +127,7 @@ def next_entry(
     """
 
     def step(place, word, base):
-        return place + 32, dr.gather(mi.UInt32, words, place), base + 32
+        return place + 32, elements(words, place), base + 32
 
     return dr.while_loop(
         (place, word, base),
@@ -145,7 +145,7 @@ def pack_records(columns: list[Float], order: UInt32) -> Float:
     """
     N = dr.width(order)
     width = -(-len(columns) // 4)
-    values = [dr.gather(mi.Float, column, order) for column in columns]
+    values = [elements(column, order) for column in columns]
     values += [mi.Float(0)] * (4 * width - len(values))
     records = dr.empty(mi.Float, 4 * width * N)
     lane = dr.arange(mi.UInt32, N) * width
@@ -193,8 +193,8 @@ def _cells_within(
         splats: N splats.
         cell: width and height of a cell in blocks.
     """
-    across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0)) * (ACROSS // cell[0])
-    down = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(1)) * (DOWN // cell[1])
+    across = dr.opaque(mi.UInt32, region.across * ACROSS // cell[0])
+    down = dr.opaque(mi.UInt32, region.down * DOWN // cell[1])
 
     def span(axis: int, cells: UInt32) -> tuple[UInt32, UInt32]:
         center = dr.detach(splats.shape[axis])
@@ -214,7 +214,7 @@ def _cells_within(
         return (x0, y0, x1, y1), (x1 - x0) * (y1 - y0)
 
     def before(x: UInt32, y: UInt32) -> UInt32:
-        return dr.gather(mi.UInt32, table, y * (across + 1) + x)
+        return elements(table, y * (across + 1) + x)
 
     return (x0, y0, x1, y1), before(x1, y1) - before(x0, y1) - before(x1, y0) + before(x0, y0)
 
@@ -236,13 +236,13 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
         return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
     slot_at = dr.empty(mi.UInt32, total)
     depth_order_at = dr.empty(mi.UInt32, total)
-    across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
+    across = dr.opaque(mi.UInt32, region.across)
 
     depth_order = dr.arange(mi.UInt32, N)
     mode = dr.ReduceMode.NoConflicts
 
     def enter(place, column, tile, slot_at, depth_order_at):
-        slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
+        slot = tile if region.whole else elements(region.slot_of, tile)
         is_drawn = region.whole or slot != NO_SLOT
         dr.scatter(slot_at, slot, place, active=is_drawn, mode=mode)
         dr.scatter(depth_order_at, depth_order, place, active=is_drawn, mode=mode)
@@ -259,7 +259,7 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     dr.eval(slot_at, depth_order_at)
 
     perm, slot_at, first, end = sorted_buckets(slot_at, slots)
-    entries = dr.gather(mi.UInt32, depth_order_at, perm)
+    entries = elements(depth_order_at, perm)
     dr.eval(entries)
     return _Tiles(entries, slot_at, first, end)
 
@@ -270,7 +270,7 @@ def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, 
     """
     total = dr.width(keys)
     perm = stable_order(keys, buckets)
-    sorted_keys = dr.gather(mi.UInt32, keys, perm)
+    sorted_keys = elements(keys, perm)
     dr.eval(sorted_keys)
     first = dr.zeros(mi.UInt32, buckets)
     end = dr.zeros(mi.UInt32, buckets)
@@ -311,8 +311,8 @@ def _block_bits(
     tilt = b / dr.maximum(c, 1e-30)
     slope_x = -b / dr.maximum(a, 1e-30)
     slope_y = -a / dr.maximum(c, 1e-30) * tilt / dr.fma(tilt, tilt, 1)
-    px = dr.gather(mi.Float, region.corner_x, slot) - mx
-    py = dr.gather(mi.Float, region.corner_y, slot) - my
+    px = elements(region.corner_x, slot) - mx
+    py = elements(region.corner_y, slot) - my
     reach = log2_opacity - log2(config.alpha_min) + _TEST_SLACK
     columns = []
     for i in range(ACROSS):
@@ -369,20 +369,18 @@ def _block_bits(
         log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
         dr.eval(mask, log2_transmitted)
         behind = dr.prefix_sum(mi.Float64(log2_transmitted))
-        first = dr.gather(mi.UInt32, tiles.first, slot)
+        first = elements(tiles.first, slot)
         log2_transmittance = behind - dr.gather(mi.Float64, behind, first)
         # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
         least = log2(max(config.stop_transmittance, 1e-38)) - 0.5
         mask = dr.select(log2_transmittance < least, 0, mask)
     dr.eval(mask)
-    place = dr.gather(mi.UInt32, first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
+    place = elements(first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
     masks = dr.zeros(mi.UInt32, num_words * 32)
-    dr.scatter(
-        masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts
-    )
+    dr.scatter(masks, mask, place - elements(tiles.first, slot), mode=dr.ReduceMode.NoConflicts)
     dr.eval(masks)
     word = dr.arange(mi.UInt32, num_words) * 32
-    rows = _transposed([dr.gather(mi.UInt32, masks, word + k) for k in range(32)])
+    rows = _transposed([elements(masks, word + k) for k in range(32)])
     words = dr.empty(mi.UInt32, num_words * 32)
     for k, row in enumerate(rows):
         dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
@@ -393,13 +391,12 @@ def _block_bits(
 def _farthest_limits(limits: Float, region: Region) -> Float:
     """Return the largest depth limit in each block of a region's tiles [tiles ACROSS DOWN]."""
     lane = dr.arange(mi.UInt32, region.width * region.height)
-    row = quotient(lane, region.width)
-    column = lane - row * dr.opaque(mi.UInt32, region.width)
-    across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
+    row, column = quotient_and_rest(lane, region.width)
+    across = dr.opaque(mi.UInt32, region.across)
     x = column // region.block[0]
     y = row // region.block[1]
     tile = y // DOWN * across + x // ACROSS
-    slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
+    slot = tile if region.whole else elements(region.slot_of, tile)
     farthest = dr.full(mi.Float, -dr.inf, region.num_tiles * ACROSS * DOWN)
     bit = y % DOWN * ACROSS + x % ACROSS
     dr.scatter_reduce(
@@ -439,7 +436,7 @@ def _set_bits(words: UInt32, begin: UInt32, end: UInt32) -> UInt32:
     """Return the number of set bits in every block's words."""
 
     def add(place, count):
-        return place + 32, count + dr.popcnt(dr.gather(mi.UInt32, words, place))
+        return place + 32, count + dr.popcnt(elements(words, place))
 
     return dr.while_loop(
         (begin, mi.UInt32(0)), lambda place, count: place < end, add, label="set bits"

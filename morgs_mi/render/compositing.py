@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Float
-from morgs_mi.render.backend import sections
+from morgs_mi.render.backend import elements, sections
 from morgs_mi.render.blocks import BlockLists, pack_records
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.loops import (
@@ -19,7 +19,7 @@ from morgs_mi.render.loops import (
     record_packets,
     tangent,
 )
-from morgs_mi.render.region import NO_SLOT, Region, quotient
+from morgs_mi.render.region import NO_SLOT, Region, quotient, quotient_and_rest
 
 
 def blend(
@@ -129,16 +129,13 @@ def record_gradients(
         sums = recorded(adjoint, layout)(section, images, grads, first_record, sums)
     place = dr.arange(mi.UInt32, N * stride)
     parts = [
-        dr.gather(mi.Float, sums, place + dr.opaque(mi.UInt32, k * N * stride))
-        for k in range(num_sections)
+        elements(sums, place + dr.opaque(mi.UInt32, k * N * stride)) for k in range(num_sections)
     ]
     sums = sum(parts[1:], parts[0])
     dr.eval(sums)
     lane = lists.depth_order_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
-    return [
-        dr.gather(mi.Float, sums, lane + k) for k in range(start, layout.geometry + layout.columns)
-    ]
+    return [elements(sums, lane + k) for k in range(start, layout.geometry + layout.columns)]
 
 
 def _cropped(image: Float, region: Region, size: int) -> Float:
@@ -147,9 +144,7 @@ def _cropped(image: Float, region: Region, size: int) -> Float:
         return image
     lane = dr.arange(mi.UInt32, region.width * region.height * size)
     row = quotient(lane, region.width * size)
-    return dr.gather(
-        mi.Float, image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size)
-    )
+    return elements(image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
 
 
 def padded(image: Float, region: Region, size: int) -> Float:
@@ -164,7 +159,6 @@ def padded(image: Float, region: Region, size: int) -> Float:
         # of the gradient.
         return image * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
-    row = quotient(lane, region.row * size)
-    column = lane - row * dr.opaque(mi.UInt32, region.row * size)
+    row, column = quotient_and_rest(lane, region.row * size)
     width = dr.opaque(mi.UInt32, region.width * size)
     return dr.gather(mi.Float, image, row * width + column, active=column < width)

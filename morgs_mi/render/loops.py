@@ -31,7 +31,7 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Bool, Float, UInt32
-from morgs_mi.render.backend import block_shape, exp2, on_aligned_stack, on_cpu
+from morgs_mi.render.backend import block_shape, elements, exp2, on_aligned_stack, on_cpu
 from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.cut import PROFILE, Cut
 from morgs_mi.render.region import NO_SLOT
@@ -112,7 +112,7 @@ class _Block:
         self.area = self.width * self.height
         self.place = of_lane(lists.place)
         self.rows = of_lane(lists.rows)
-        self.pitch = dr.gather(mi.UInt32, lists.pitch, mi.UInt32(0))
+        self.pitch = elements(lists.pitch, mi.UInt32(0))
         # Centre of the first pixel.
         self.x, self.y = (mi.Float(of_lane(v)) + 0.5 for v in (lists.x, lists.y))
         begin = of_lane(lists.begin)
@@ -132,7 +132,7 @@ class _Block:
         entry.
         """
         place, word, base = walk
-        depth_order = dr.gather(mi.UInt32, self.lists.entries, base + dr.tzcnt(word))
+        depth_order = elements(self.lists.entries, base + dr.tzcnt(word))
         next_walk = next_entry(place, word & (word - 1), base, self.end, self.lists.words)
         return depth_order, next_walk
 

@@ -18,7 +18,7 @@ from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
 from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Bool, Float, Jit, Tensor
-from morgs_mi.render.backend import block_shape
+from morgs_mi.render.backend import block_shape, elements
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
 from morgs_mi.render.compositing import Layout, blend
@@ -178,28 +178,24 @@ def rasterize(
         region = full_view(view.width, view.height, block_shape(config), len(cameras), mi.variant())
     stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
-
-    def empty_image() -> Image:
-        images = {name: dr.zeros(mi.TensorXf, (*stack, sizes[name])) for name in channels}
-        if background is not None and "color" in images:
-            zeros = dr.zeros(mi.Float, prod((*stack, 3)))
-            images["color"] = _tensor(_over(background, zeros, zeros), region, (*stack, 3))
-        return _image(images)
-
-    if dr.prod(gaussians.means.shape[:1]) == 0:
-        return empty_image()
     cut = limits is not None
     projected = (*blended, "profile") if cut else blended
     rows = None
-    if not region.whole and static_splats is None:  # those that touch no block are not blended
+    if not int(gaussians.means.shape[0]):
+        rows = mi.UInt32()
+    elif not region.whole and static_splats is None:  # those that touch no block are not blended
         with dr.suspend_grad():
             bare = project(dr.detach(gaussians), view, (), config)
             visible = touches(bare, region)
             dr.schedule(visible)
             _check_finite(bare.finite, gaussians, cameras, features)
             rows = dr.compress(visible)
-        if not dr.width(rows):
-            return empty_image()
+    if rows is not None and not dr.width(rows):
+        images = {name: dr.zeros(mi.TensorXf, (*stack, sizes[name])) for name in channels}
+        if background is not None and "color" in images:
+            zeros = dr.zeros(mi.Float, prod((*stack, 3)))
+            images["color"] = _tensor(_over(background, zeros, zeros), region, (*stack, 3))
+        return _image(images)
     parts = [project(gaussians, part, projected, config, rows, features) for part in cameras]
     splats = parts[0] if len(parts) == 1 else _stacked(parts)
     if static_splats is not None:
@@ -250,7 +246,7 @@ def _over(background: Sequence[float] | Jit | None, values: Float, weight: Float
     else:
         behind = from_numpy(mi.Float, np.asarray(color))
     # Numbers of their own: the gradient of one array would be added by all pixels to three places.
-    red, green, blue = (dr.gather(mi.Float, behind, mi.UInt32(k)) for k in range(3))
+    red, green, blue = (elements(behind, mi.UInt32(k)) for k in range(3))
     component = dr.arange(mi.UInt32, dr.width(weight)) % 3
     return dr.fma(
         1 - weight,
@@ -306,16 +302,16 @@ def _problems(
             "expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got "
             f"{mi.variant()!r}; call mi.set_variant() first"
         )
-    attributes = attribute_channels()
-    choices = ("color", "alpha", "depth", "motion", "guided_motion", *attributes)
+    motion = BY_ACTIVATED_NAME["motion"]
+    required = {"motion": motion, "guided_motion": motion, **attribute_channels()}
+    choices = ("color", "alpha", "depth", *required)
     for name in (*channels, *detach_weights):
-        if name not in choices and not (name == "features" and name not in channels):
+        if name not in choices and (name != "features" or name in channels):
             yield (
                 f"`channels` must be out of {', '.join(choices)}, got {name!r}; use one of these, "
                 "or pass other values as `features`"
             )
-    motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
-    for name, attribute in {**motions, **attributes}.items():
+    for name, attribute in required.items():
         if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
             yield (
                 f"channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or "
@@ -328,21 +324,21 @@ def _problems(
         check_type("rasterize()", "camera", camera, Camera, OF_SENSOR)
     view = cameras[0]
     V = len(cameras)
-    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras))
+    sizes = [*dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)]
     if len(sizes) > 1:
         yield (
-            f"`camera` must be cameras of the same size, got {' and '.join(sizes[:2])}; render one "
+            f"`camera` must be cameras of the same size, got {' and '.join(sizes)}; render one "
             "camera at a time"
         )
     pixels = V * view.width * view.height
     if pixels > 2**28:
         yield (
-            f"the image must have at most 2^28 pixels, got {'' if V == 1 else f'{V} times '}"
-            f"{sizes[0]}; render it in tiles, one camera each"
+            f"the image must have at most 2^28 pixels, got {V} times {sizes[0]}; render it in "
+            "tiles, one camera each"
         )
     if pixels >= _LARGE:
-        images = f"{'an image' if V == 1 else f'{V} images'} of {sizes[0]} pixels"
-        remedy = "render a smaller one, or tiles, one camera each"
+        images = f"{V} x {sizes[0]} pixels"
+        remedy = "render a smaller image, or tiles, one camera each"
         check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
     background, features, config, region, static_splats, depth_limit = options.values()

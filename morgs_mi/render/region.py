@@ -17,10 +17,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from morgs_mi.core.checks import check_type
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
-from morgs_mi.render.backend import block_shape
+from morgs_mi.render.backend import block_shape, elements
 from morgs_mi.render.render_config import RenderConfig
 
 # Blocks of a tile, across and down: one for each bit of a word.
@@ -60,13 +59,17 @@ class BlockGrid:
 
 
 class Region:
-    """The blocks of a view that contain at least one requested pixel.
+    """Some blocks of a view, or of several views.
 
     Images on a region are [A, block_height, block_width, C], block by block, A blocks in all.
 
     Args:
-        mask: [H, W] bool, the requested pixels.
-        config: block shape.
+        grid: all blocks of a view.
+        blocks: the requested ones, at least one, bool [rows, columns], of all views.
+        whole: whether images are [H, W, C]; all blocks must be requested.
+        views: number of views, one below the other; a second one begins after the rows of tiles of
+            a grid.
+        valid: mask of an image's pixels that are in a view; None: those of equal views.
 
     Attributes:
         grid: all blocks of the view.
@@ -76,38 +79,7 @@ class Region:
         block: (width, height) of a block in pixels.
         num_blocks: number of blocks A.
         whole: whether images are [H, W, C] instead, for a region made by `full_view`.
-
-    Raises:
-        ValueError: no pixel is requested, or `mask` is not a boolean image.
     """
-
-    def __init__(self, mask: np.ndarray, config: RenderConfig | None = None) -> None:
-        check_type("Region()", "mask", mask, np.ndarray)
-        is_mask = mask.ndim == 2 and mask.dtype == bool
-        if not is_mask or not mask.any():
-            description = "none" if is_mask else f"{mask.dtype} {mask.shape}"
-            raise ValueError(
-                "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
-                f"{description}; skip a view in which nothing is drawn."
-            )
-        grid = BlockGrid(mask.shape[1], mask.shape[0], block_shape(config or RenderConfig()))
-        vars(self).update(vars(Region.of(grid, grid.counts(mask) > 0)))
-
-    @classmethod
-    def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> Region:
-        """Return the region of some blocks of a view, at least one.
-
-        Args:
-            grid: all blocks of the view.
-            blocks: the requested ones, bool [rows, columns], of all views.
-            whole: whether images are [H, W, C]; all blocks must be requested.
-            views: number of equal views, one below the other; several must be whole.
-        """
-        region = cls.__new__(cls)
-        region._lay_out(grid, blocks, whole, views)
-        pixels = np.ones((region.height, region.width), bool)
-        region._weigh(np.ones((), bool) if whole else region.crop(pixels))
-        return region
 
     # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in
     # memory, its rows.
@@ -118,7 +90,6 @@ class Region:
     place: UInt32
     rows: UInt32
     pitch: UInt32  # packets from a row of a block to the next, [1]
-    tile_grid: UInt32  # tiles of the view across and down, [2]
     slot_of: UInt32  # slot of every tile of the view, or NO_SLOT
     block_table: UInt32  # summed areas of the drawn blocks and of the tiles that have one
     tile_table: UInt32
@@ -128,14 +99,14 @@ class Region:
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
     _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
-    def _weigh(self, mask: np.ndarray) -> None:
-        """Set the weights from the mask of an image's pixels that are in the view."""
-        self.weights = None if mask.all() else from_numpy(mi.Float, mask)
-
-    def _lay_out(
-        self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1
+    def __init__(
+        self,
+        grid: BlockGrid,
+        blocks: np.ndarray,
+        whole: bool = False,
+        views: int = 1,
+        valid: np.ndarray | None = None,
     ) -> None:
-        """Number the blocks; a second view begins after the rows of tiles of a grid."""
         self.grid = grid
         self.width = grid.width
         self.height = views * grid.height
@@ -177,7 +148,6 @@ class Region:
             "place": place // 4,
             "pitch": [self.row // 4],
             "rows": rows,
-            "tile_grid": [self.across, self.down],
             "slot_of": slots,
             "block_table": summed_area(blocks),
             "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
@@ -186,6 +156,16 @@ class Region:
             setattr(self, name, from_numpy(mi.UInt32, values))
         self.corner_x = from_numpy(mi.Float, tiles % self.across * (ACROSS * bw))
         self.corner_y = from_numpy(mi.Float, tiles // self.across % self.down * (DOWN * bh))
+        if valid is None:
+            pixels = np.ones((self.height, self.width), bool)
+            valid = np.ones((), bool) if whole else self.crop(pixels)
+        self.weights = None if valid.all() else from_numpy(mi.Float, valid)
+
+    @classmethod
+    def of(cls, mask: np.ndarray, config: RenderConfig | None = None) -> Region:
+        """Return the region of the blocks that contain a pixel of a mask [H, W], at least one."""
+        grid = BlockGrid(mask.shape[1], mask.shape[0], block_shape(config or RenderConfig()))
+        return cls(grid, grid.counts(mask) > 0)
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of an image with `channels` floats per pixel on this region."""
@@ -202,15 +182,8 @@ class Region:
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...],
         0 outside it.
-
-        Raises:
-            ValueError: the image has another size than the view.
         """
-        if image.shape[:2] != (self.height, self.width):
-            raise ValueError(
-                f"Region.crop(): `image` must be [{self.height}, {self.width}, ...], got "
-                f"{list(image.shape)}; resize it to the view."
-            )
+        assert image.shape[:2] == (self.height, self.width)  # others would be read beyond their end
         row, column = self._blocks
         width, height = self.block
         # The blocks that lie in the image as a whole, [rows, height, columns, width, ...]. A view:
@@ -247,13 +220,13 @@ class Region:
     def pixels(self, lane: UInt32) -> tuple[UInt32, UInt32]:
         """Return the coordinates (x, y) in the view of the pixels at some places of an image."""
         if self.whole:
-            y = quotient(lane, self.row)
-            return lane - y * dr.opaque(mi.UInt32, self.row), y
+            y, x = quotient_and_rest(lane, self.row)
+            return x, y
         width, height = self.block
         block = lane // (width * height)
         within = lane - block * (width * height)
-        x = dr.gather(mi.UInt32, self.x, block) + within % width
-        return x, dr.gather(mi.UInt32, self.y, block) + within // width
+        x = elements(self.x, block) + within % width
+        return x, elements(self.y, block) + within // width
 
 
 def joined(regions: Sequence[Region]) -> Region:
@@ -265,17 +238,13 @@ def joined(regions: Sequence[Region]) -> Region:
     """
     bw, bh = regions[0].block
     rows, columns = np.max([part.drawn.shape for part in regions], axis=0).tolist()
-    region = Region.__new__(Region)
     blocks = [
         np.pad(part.drawn, [(0, rows - part.drawn.shape[0]), (0, columns - part.drawn.shape[1])])
         for part in regions
     ]
     grid = BlockGrid(columns * bw, rows * bh, (bw, bh))
-    region._lay_out(grid, np.concatenate(blocks), views=len(regions))
-    region._weigh(
-        np.concatenate([part.crop(np.ones((part.height, part.width), bool)) for part in regions])
-    )
-    return region
+    valid = [part.crop(np.ones((part.height, part.width), bool)) for part in regions]
+    return Region(grid, np.concatenate(blocks), views=len(regions), valid=np.concatenate(valid))
 
 
 def summed_area(grid: np.ndarray) -> np.ndarray:
@@ -292,6 +261,12 @@ def quotient(lane: UInt32, divisor: int) -> UInt32:
     double.
     """
     return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
+
+
+def quotient_and_rest(lane: UInt32, divisor: int) -> tuple[UInt32, UInt32]:
+    """Return lane // divisor and lane % divisor, likewise."""
+    whole = quotient(lane, divisor)
+    return whole, lane - whole * dr.opaque(mi.UInt32, divisor)
 
 
 def on_region(values: Float, region: Region) -> Float:
@@ -320,4 +295,4 @@ def full_view(
     """
     grid = BlockGrid(width, height, block)
     blocks = grid.counts(np.ones((height, width), bool)) > 0
-    return Region.of(grid, np.tile(blocks, (views, 1)), whole=True, views=views)
+    return Region(grid, np.tile(blocks, (views, 1)), True, views)

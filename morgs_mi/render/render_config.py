@@ -6,7 +6,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import Positive, config_class
 
 
 @config_class
@@ -21,7 +21,7 @@ class RenderConfig:
     """Reduce the opacity by what the low-pass filter adds to a splat's area, sqrt(det S / det (S +
     eps2d I)) (Yu et al. 2024): small splats fade instead of growing. For models that were trained
     so."""
-    alpha_min: Annotated[float, Gt(0)] = 1.0 / 255.0
+    alpha_min: Positive = 1.0 / 255.0
     """Alpha below which a Gaussian is skipped at a pixel: it cannot change an 8-bit image."""
     alpha_max: Annotated[float, Gt(0), Lt(1)] = 0.99
     """Upper limit of alpha; it bounds 1 / (1 - alpha) in the adjoint."""

@@ -20,12 +20,13 @@ from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.backend import elements
 from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
 from morgs_mi.render.compositing import Layout, blend, record_gradients
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import Splats, Views, project
-from morgs_mi.render.region import Region, joined, quotient
+from morgs_mi.render.region import Region, joined, quotient_and_rest
 
 
 class ViewGroup:
@@ -48,7 +49,7 @@ class ViewGroup:
         self.views = tuple(views)
         self.regions = tuple(
             view.region
-            or Region(np.ones((view.camera.height, view.camera.width), bool), view.config)
+            or Region.of(np.ones((view.camera.height, view.camera.width), bool), view.config)
             for view in views
         )
         self.region = joined(self.regions)
@@ -72,15 +73,13 @@ class ViewGroup:
         cameras = [view.camera for view in self.views]
         with dr.suspend_grad():
             lane = dr.arange(mi.UInt32, N * V)
-            view = quotient(lane, N)
-            row = lane - view * dr.opaque(mi.UInt32, N)
+            view, row = quotient_and_rest(lane, N)
             lanes = dr.compress(
                 touches(project(gaussians, Views(cameras, view), (), self.config, row), self.region)
             )
             splats = self._static
             if dr.width(lanes):
-                view = quotient(lanes, N)
-                row = lanes - view * dr.opaque(mi.UInt32, N)
+                view, row = quotient_and_rest(lanes, N)
                 visible = project(gaussians, Views(cameras, view), ("color",), self.config, row)
                 splats = visible if splats is None else visible.concatenated_with(splats)
             if splats is None:
@@ -174,7 +173,7 @@ class Drawing:
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
             grads = record_gradients(replace(lists, records=records), layout, [image], [image])
             place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after
-            lane_sums = [dr.gather(mi.Float, grad, place) for grad in grads]
+            lane_sums = [elements(grad, place) for grad in grads]
             dr.eval(lane_sums)
         return lane_sums
 

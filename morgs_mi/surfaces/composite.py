@@ -116,7 +116,7 @@ def _in_front(
     mask = np.isfinite(limit)
     if not mask.any():
         return None
-    region = Region(mask)
+    region = Region.of(mask)
     part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=limit)
     index_image = region.uncropped(np.arange(region.num_pixels).reshape(region.shape(1)[:3]))
     index = from_numpy(mi.UInt32, index_image[y : y + height, x : x + width])

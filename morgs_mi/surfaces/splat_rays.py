@@ -19,7 +19,6 @@ front to back, in which the next node follows from n without a stack.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import sqrt
 from typing import Any
 
@@ -40,25 +39,21 @@ _SORTED = 16
 _THINNEST = 1e-4
 
 
-@dataclass(frozen=True)
 class _Tree:
-    """Boxes of a complete binary tree with 2^depth leaves."""
+    """Boxes of a complete binary tree with 2^depth leaves.
 
-    depth: UInt32  # depth of the leaves; the root has depth 0
-    # For each axis, the bits of a leaf's number that choose a side along it.
-    flips: tuple[UInt32, UInt32, UInt32]
-    boxes: Float  # lower and upper corner of every node, from 1, in rows of eight floats
+    Args:
+        centers: centres of N boxes [N, 3].
+        halves: half their sizes [N, 3].
 
-    @staticmethod
-    def of(centers: np.ndarray, halves: np.ndarray) -> tuple[_Tree, np.ndarray]:
-        """Return the tree of N boxes, and the box of each leaf [2^depth]; N where there is none.
+    Attributes:
+        order: the box of each leaf [2^depth]; N where there is none.
+    """
 
-        Args:
-            centers: centres of the boxes [N, 3].
-            halves: half their sizes [N, 3].
-        """
+    def __init__(self, centers: np.ndarray, halves: np.ndarray) -> None:
         depth = max(len(centers) - 1, 0).bit_length()
         order, flips = _leaf_order(centers, depth)
+        self.order = order
         # Rounding must not make a box smaller.
         halves = halves * (1 + 1e-5) + 1e-6 * np.abs(centers)
         low = _node_corners(np.concatenate([centers - halves, [[np.inf] * 3]])[order], np.min)
@@ -68,8 +63,11 @@ class _Tree:
         rows[:, :3] = low
         rows[:, 4:7] = np.where(low > high, np.inf, high)
         # No literals, with which every scene would compile its own kernel.
-        levels, x, y, z = (dr.opaque(mi.UInt32, value) for value in (depth, *flips))
-        return _Tree(levels, (x, y, z), from_numpy(mi.Float, rows)), order
+        self.depth = dr.opaque(mi.UInt32, depth)
+        # For each axis, the bits of a leaf's number that choose a side along it.
+        self.flips = [dr.opaque(mi.UInt32, bits) for bits in flips]
+        # Lower and upper corner of every node, from 1.
+        self.boxes = from_numpy(mi.Float, rows)
 
     def walk(
         self,
@@ -188,7 +186,8 @@ class SplatRays:
         reach = np.sqrt(2 * np.log(np.maximum(opacities / self._config.alpha_min, 1)))
         indices = np.flatnonzero(reach > 0)
         halves = reach[:, None] * np.linalg.norm(axes * scales[:, None], axis=2)
-        self._tree, order = _Tree.of(means[indices], halves[indices])
+        self._tree = _Tree(means[indices], halves[indices])
+        order = self._tree.order
         index = np.concatenate([indices, [0]])[order]
         # Rows of four floats, which are read as one packet.
         rows = np.zeros((len(index), 4, 4))

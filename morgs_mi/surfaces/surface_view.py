@@ -13,13 +13,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
-from morgs_mi.core.types import Bool, Float, Tensor, UInt32
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.render.backend import elements
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.splat_rays import SplatRays
 
@@ -336,7 +339,7 @@ def coverage_and_depth(
         end = dr.opaque(mi.UInt32, len(grid))
 
         def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
-            k = dr.gather(mi.UInt32, cells, i)
+            k = elements(cells, i)
             rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
             intersection = scene.ray_intersect_preliminary(rays, coherent=True)
             hit = intersection.is_valid()
@@ -349,18 +352,13 @@ def coverage_and_depth(
     count, total = cast(pixel, _FIRST)
     rays = dr.full(mi.Float, len(_FIRST), across * down)
     dr.eval(count, total, rays)
-    neighbours = (
-        (lane - 1, column > 0),
-        (lane + 1, column + 1 < columns),
-        (lane - columns, row > 0),
-        (lane + columns, lane + columns < across * down),
-    )
-    is_mixed: Bool = (count > 0) & (count < len(_FIRST))
-    for place, valid in neighbours:
-        is_mixed |= dr.gather(mi.Float, count, place, active=valid) != count
-    edge: Any = dr.compress(is_mixed)
-    if dr.width(edge):
-        more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
+    counts = np.asarray(count).reshape(down, across)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    differs = cv2.dilate(counts, cross) != cv2.erode(counts, cross, borderValue=0)
+    edge = np.flatnonzero(differs | (counts % len(_FIRST) > 0))
+    if len(edge):
+        edge = from_numpy(mi.UInt32, edge)
+        more, deeper = cast(elements(pixel, edge), _OTHERS)
         for target, values in ((count, more), (total, deeper), (rays, mi.Float(len(_OTHERS)))):
             dr.scatter_add(target, values, edge)
     dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.rig import mean_views
-from morgs_mi.fit.detail import count_details, with_num_gaussians
+from morgs_mi.fit.budget import plan_first_frame
+from morgs_mi.fit.detail import count_details
 from morgs_mi.fit.fit_config import DetailConfig, FitConfig
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
@@ -55,12 +56,12 @@ def count(
     cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig = CONFIG
 ) -> int | None:
     """Return the number of Gaussians of views that all show one image."""
-    return with_num_gaussians(
-        FitConfig(detail=config), [View(camera, image) for camera in cameras], points
-    ).num_gaussians
+    fit_config = FitConfig(detail=config, first_frame_seconds=1e9)
+    views = [View(camera, image) for camera in cameras]
+    return plan_first_frame(views, points, fit_config)[0].num_gaussians
 
 
-def test_with_num_gaussians__counts_what_several_views_see_once():
+def test_plan_first_frame__counts_what_several_views_see_once():
     (camera,) = look_at_cameras([(0, 0, -4)], 40)
     image = texture()
     one = count([camera], image, POINTS)
@@ -71,13 +72,8 @@ def test_with_num_gaussians__counts_what_several_views_see_once():
     assert count(beside, image, points) == 2 * one
 
 
-def test_with_num_gaussians__stays_within_its_limits():
+def test_plan_first_frame__stays_within_its_limits():
     cameras = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60)
     image = texture()
     for limit in ({"least_gaussians": 5000}, {"most_gaussians": 20}):
         assert count(cameras, image, POINTS, replace(CONFIG, **limit)) == next(iter(limit.values()))
-
-
-def test_with_num_gaussians__keeps_a_given_number():
-    config = FitConfig(num_gaussians=123)
-    assert with_num_gaussians(config, [], POINTS) is config

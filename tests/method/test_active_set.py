@@ -19,6 +19,7 @@ from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 RENDER = RenderConfig()
+CONFIG = ActiveSetConfig()
 EXTENT = 3.0
 V = 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
@@ -70,11 +71,13 @@ def changes(previous, current) -> dict[int, np.ndarray]:
     return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
+def found(gaussians, changed, config=CONFIG) -> ActiveSet:
+    return find_active_set(gaussians, cameras(), changed, CHANNELS, RENDER, config)
+
+
 def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, current):
     config = ActiveSetConfig(min_responsibility=0.1)  # half of one of the five views
-    active = find_active_set(
-        previous, cameras(), changes(previous, current), CHANNELS, RENDER, config
-    )
+    active = found(previous, changes(previous, current), config)
     mask = np.isin(np.arange(len(previous)), active.indices)
     assert mask[HIDDEN:].mean() > 0.9  # the others are inside the ball
     assert mask[:HIDDEN].mean() < 0.15
@@ -85,7 +88,7 @@ def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, cu
 
 def test_find_active_set__is_empty_without_changes(previous):
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
-    active = find_active_set(previous, cameras(), nothing, CHANNELS, RENDER)
+    active = found(previous, nothing)
     assert not active.views
     assert active.fractions == {"gaussians": 0, "views": 0, "pixels": 0}
     fitted = fit(previous, active, [], FitConfig(sh_degree=0))
@@ -99,7 +102,7 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(previous
     wall.
     """
     wall = previous.select(np.arange(HIDDEN))
-    active = find_active_set(wall, cameras(), changes(wall, previous), CHANNELS, RENDER)
+    active = found(wall, changes(wall, previous))
     covered = [active.views[view].region.mask for view in range(V)]
     for change, drawn in zip(changes(wall, previous).values(), covered, strict=True):
         assert drawn[change].mean() > 0.9
@@ -108,9 +111,7 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(previous
     for min_explained in (0.0, 1.0):
         monkeypatch.setattr("morgs_mi.method.active_set.EXPLAINED", min_explained)
         config = ActiveSetConfig(min_responsibility=0.5)
-        active_set = find_active_set(
-            wall, cameras(), changes(wall, previous), CHANNELS, RENDER, config
-        )
+        active_set = found(wall, changes(wall, previous), config)
         counts.append(len(active_set.indices))
     assert counts[0] < counts[1]
 
@@ -123,7 +124,7 @@ def test_find_active_set__draws_what_hardly_changed_in_some_views_only(
     def drawn(quiet_views, quiet=0.9):
         monkeypatch.setattr("morgs_mi.method.active_set.QUIET", quiet)
         config = ActiveSetConfig(quiet_views=quiet_views)
-        active_set = find_active_set(previous, cameras(), changed, CHANNELS, RENDER, config)
+        active_set = found(previous, changed, config)
         return active_set, {view: active_set.views[view].region.mask for view in range(V)}
 
     every, everywhere = drawn(V)
@@ -140,15 +141,13 @@ def test_find_active_set__keeps_what_moved_for_one_more_frame(previous):
     logits = np.where(np.arange(len(previous)) == 7, 2.0, -2.0)
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
     previous_gaussians = replace(previous, logit_confidence=logits)
-    assert find_active_set(
-        previous_gaussians, cameras(), nothing, CHANNELS, RENDER
-    ).indices.tolist() == [7]
+    assert found(previous_gaussians, nothing).indices.tolist() == [7]
 
 
 def test_find_active_set__takes_everything_where_most_pixels_changed(previous):
     half = np.zeros((96, 128), bool)
     half[:60] = True
-    active = find_active_set(previous, cameras(), dict.fromkeys(range(V), half), CHANNELS, RENDER)
+    active = found(previous, dict.fromkeys(range(V), half))
     assert active.fractions == {"gaussians": 1, "views": 1, "pixels": 1}
 
 
@@ -158,7 +157,7 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(previous, curr
     density = DensityConfig(later_frames=grows, births=0.05, min_error=0)
     config = FitConfig(sh_degree=0, epochs=12, density=density)
     truth = images_of(current)
-    active = find_active_set(previous, cameras(), changes(previous, current), CHANNELS, RENDER)
+    active = found(previous, changes(previous, current))
     errors = {}
     for name, some in (("whole", full_active_set(previous, cameras(), RENDER)), ("active", active)):
         fitted = fit(previous, some, truth, config)

@@ -51,7 +51,7 @@ def test_union__is_the_blocks_that_the_chosen_boxes_touch(boxes):
 @pytest.mark.parametrize("factor", [1, 2])
 def test_within__counts_pixels_in_the_blocks_of_a_reduced_view(boxes, factor):
     mask = np.random.default_rng(2).random((48 // factor, 64 // factor)) < 0.02
-    region = Region(mask, RenderConfig())
+    region = Region.of(mask, RenderConfig())
     blocks = region.mask.repeat(factor, 0).repeat(factor, 1)
     expected = [blocks[box].sum() for box in slices(boxes)]
     assert 0 < np.mean(expected) < np.asarray(boxes.area).mean()

@@ -31,25 +31,29 @@ def noisy_image(rng, level=0.0, disc=None, noise=NOISE):
     return np.clip(image + rng.normal(0, noise, image.shape), 0, 255).astype(np.uint8)
 
 
+def changed(reference, image, valid=None, config=None):
+    return change_mask(reference, image, valid, config or ChangeConfig())
+
+
 def test_change_mask__ignores_noise():
     rng = np.random.default_rng(0)
-    assert not any(change_mask(noisy_image(rng), noisy_image(rng)).any() for _ in range(20))
+    assert not any(changed(noisy_image(rng), noisy_image(rng)).any() for _ in range(20))
 
 
 def test_change_mask__finds_a_disc():
     rng = np.random.default_rng(1)
-    mask = change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)))
+    mask = changed(noisy_image(rng), noisy_image(rng, disc=(70, 50)))
     y, x = np.mgrid[:H, :W]
     disc = (x - 70) ** 2 + (y - 50) ** 2 < 15**2
     assert mask[disc].all()
     assert not mask[(x - 70) ** 2 + (y - 50) ** 2 > 19**2].any()
     valid = x < 70
-    assert not change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)), valid)[~valid].any()
+    assert not changed(noisy_image(rng), noisy_image(rng, disc=(70, 50)), valid)[~valid].any()
 
 
 def test_change_mask__covers_a_change_of_light():
     rng = np.random.default_rng(2)
-    assert change_mask(noisy_image(rng), noisy_image(rng, level=12)).mean() > 0.99
+    assert changed(noisy_image(rng), noisy_image(rng, level=12)).mean() > 0.99
 
 
 def test_change_mask__covers_an_image_without_static_pixels():
@@ -57,7 +61,7 @@ def test_change_mask__covers_an_image_without_static_pixels():
     noise = cv2.resize(
         rng.integers(0, 255, (15, 20, 3), np.uint8), (W, H), interpolation=cv2.INTER_NEAREST
     )
-    assert change_mask(noise, np.roll(noise, 8, axis=1)).mean() > 0.8
+    assert changed(noise, np.roll(noise, 8, axis=1)).mean() > 0.8
 
 
 def test_change_mask__ignores_noise_that_is_larger_in_some_places():
@@ -68,7 +72,7 @@ def test_change_mask__ignores_noise_that_is_larger_in_some_places():
         np.clip(128 + rng.normal(0, 1, (H, W, 3)) * noise, 0, 255).astype(np.uint8)
         for _ in range(2)
     )
-    assert change_mask(image, next_image).mean() < 0.005
+    assert changed(image, next_image).mean() < 0.005
 
 
 def test_change_mask__finds_a_change_of_colour_alone():
@@ -76,7 +80,7 @@ def test_change_mask__finds_a_change_of_colour_alone():
     image = noisy_image(rng)
     next_image = noisy_image(rng)
     next_image[40:60, 50:80] = np.clip(next_image[40:60, 50:80] + np.array([12, -12, 0]), 0, 255)
-    mask = change_mask(image, next_image)
+    mask = changed(image, next_image)
     assert mask[42:58, 52:78].all()
     assert not mask[:34].any()
 
@@ -85,8 +89,8 @@ def test_change_mask__takes_floats_like_bytes():
     rng = np.random.default_rng(8)
     image = noisy_image(rng)
     next_image = noisy_image(rng, disc=(70, 50))
-    floats = change_mask(image / np.float32(255), next_image / np.float32(255))
-    assert np.mean(floats != change_mask(image, next_image)) < 0.01
+    floats = changed(image / np.float32(255), next_image / np.float32(255))
+    assert np.mean(floats != changed(image, next_image)) < 0.01
 
 
 @pytest.mark.parametrize(("size", "step"), [(8, (2, 2, 2)), (16, (3, -3, 0))])
@@ -98,8 +102,8 @@ def test_change_mask__ignores_blocks_of_compressed_video(size: int, step: tuple[
     next_image += (
         (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
     )
-    assert not change_mask(image, next_image).any()
-    assert change_mask(image, next_image, config=ChangeConfig(min_peak=0)).mean() > 0.02
+    assert not changed(image, next_image).any()
+    assert changed(image, next_image, config=ChangeConfig(min_peak=0)).mean() > 0.02
 
 
 def test_change_mask__has_the_faint_parts_of_a_clear_change():
@@ -108,7 +112,7 @@ def test_change_mask__has_the_faint_parts_of_a_clear_change():
     next_image = image.copy()
     next_image[30:50, 40:120] -= np.linspace(8, 0, 80)[:, None]
     next_image[80:100, 40:120] -= 2
-    mask = change_mask(image / 255, next_image / 255)
+    mask = changed(image / 255, next_image / 255)
     assert mask[32:48, 42:105].all()
     assert not mask[70:].any()
 
@@ -135,8 +139,8 @@ def test_change_mask__detects_slow_changes_once_they_add_up():
     waited = []
     for frame in range(1, 60):
         image = noisy_image(rng, level=0.25 * frame)
-        assert not change_mask(last, image).mean() > 0.01
-        change = change_mask(reference, image)
+        assert not changed(last, image).mean() > 0.01
+        change = changed(reference, image)
         waited.append(change.mean())
         reference = np.where(change[..., None], image, reference)
         last = image
@@ -166,7 +170,7 @@ def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_ma
     )
     image[34:66, 54:86] = patch
     next_image[34:66, 58:90] = patch
-    box = box_around(change_mask(image, next_image))
+    box = box_around(changed(image, next_image))
     masks = "grabcut" if with_masks else None
     observations = [
         observe_key_views({0: FramePair(next_image, image, box=b)}, "dis", masks)[0]
@@ -191,7 +195,7 @@ def test_observe_key_views__what_has_not_changed_has_not_moved():
     )
     image[34:66, 54:86] = patch
     next_image[34:66, 60:92] = patch
-    region = moving_region(change_mask(image, next_image))
+    region = moving_region(changed(image, next_image))
     observed = {
         name: observe_key_views({0: FramePair(next_image, image, region=r)})[0]
         for name, r in (("plain", None), ("with region", region))

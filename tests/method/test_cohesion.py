@@ -6,7 +6,7 @@ import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.cohesion import share_confidence
+from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
 from morgs_mi.method.motion_config import MotionConfig
 from tests.scenes.gaussians import isotropic, random_sheet
 
@@ -37,8 +37,10 @@ def moving(share, seed=1):
     return np.where(~WALL & (rng.random(700) < share), 2.0, STILL).astype(np.float32)
 
 
-def shared(gaussians, logit, weight=WEIGHT):
-    return share_confidence(gaussians, np.arange(700), logit, STILL, weight)
+def shared(gaussians, logit, weight=WEIGHT, indices=None):
+    indices = np.arange(len(gaussians)) if indices is None else indices
+    neighbours = NeighbourIndex(np.asarray(gaussians.means))
+    return share_confidence(gaussians, indices, logit, STILL, weight, neighbours)
 
 
 def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_space():
@@ -65,7 +67,7 @@ def test_share_confidence__is_not_stopped_by_transparent_neighbours():
     ghosts = isotropic(random_sheet(rng, 100, 0.3, 1.0), 0.05, 0.01)
     everything = Gaussians.concatenate([gaussians, ghosts])
     logit = np.concatenate([moving(0.7), np.full(100, STILL, np.float32)])
-    confidence = share_confidence(everything, np.arange(800), logit, STILL, WEIGHT)
+    confidence = shared(everything, logit)
     assert (confidence[:700][~WALL] > 0).all()
 
 
@@ -74,9 +76,7 @@ def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
     red = isotropic([[0, 0, 0]], 0.05, 0.9, ((np.array([RED]) - 0.5) / SH_C0)[:, None])
     logit = np.full(701, STILL, np.float32)
     logit[-1] = 2.0
-    confidence = share_confidence(
-        Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL, WEIGHT
-    )
+    confidence = shared(Gaussians.concatenate([wall, red]), logit)
     assert confidence[-1] > 1.9
 
 
@@ -99,7 +99,7 @@ def test_share_confidence__solves_its_equation(monkeypatch):
 def test_share_confidence__counts_all_but_the_chosen_as_still():
     gaussians = wall_and_object(0.0, GREY)
     indices = np.flatnonzero(~WALL)
-    confidence = share_confidence(gaussians, indices, np.full(100, 2.0, np.float32), STILL, WEIGHT)
+    confidence = shared(gaussians, np.full(100, 2.0, np.float32), indices=indices)
     assert confidence.shape == (100,)
     assert (confidence < 0).all()
 
@@ -107,7 +107,7 @@ def test_share_confidence__counts_all_but_the_chosen_as_still():
 def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
     one = isotropic(np.zeros((1, 3)), 0.1, 0.9)
     logit = np.array([1.5], np.float32)
-    np.testing.assert_array_equal(share_confidence(one, np.arange(1), logit, STILL, WEIGHT), logit)
+    np.testing.assert_array_equal(shared(one, logit), logit)
     alone = shared(wall_and_object(0.0, GREY), moving(0.5), 0)
     np.testing.assert_array_equal(alone, moving(0.5))
-    assert not len(share_confidence(one, np.arange(0), logit[:0], STILL, WEIGHT))
+    assert not len(shared(one, logit[:0], indices=np.arange(0)))

@@ -33,7 +33,7 @@ def scene():
     )
     views = [
         ActiveView(cameras[0]),
-        make_active_view(cameras[1], Region(part), static, ("color",), RenderConfig()),
+        make_active_view(cameras[1], Region.of(part), static, ("color",), RenderConfig()),
     ]
     images = [cv2.GaussianBlur(rng.random((60, 80, 3), np.float32), (0, 0), 2) for _ in views]
     return wall, views, [Target(images[0]), Target(images[1], rng.random((60, 80)) > 0.3)]

@@ -64,7 +64,7 @@ def test_recon_loss__agrees_with_the_reference(images, weight):
 
 def test_recon_loss__of_identical_images_is_zero(images):
     target = images[1]
-    assert item(recon_loss(mi.TensorXf(target), Target(target))) == pytest.approx(0, abs=1e-6)
+    assert item(recon_loss(mi.TensorXf(target), Target(target), 0.2)) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -91,7 +91,7 @@ def test_recon_loss__ignores_masked_pixels(images):
     mask[3:9, 5:11] = False
     other = image.copy()
     other[~mask] = 7.0
-    losses = [item(recon_loss(mi.TensorXf(v), Target(target, mask))) for v in (image, other)]
+    losses = [item(recon_loss(mi.TensorXf(v), Target(target, mask), 0.2)) for v in (image, other)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
 
 
@@ -118,7 +118,7 @@ def test_flow_loss__is_the_mean_endpoint_error():
     reliable = (rng.uniform(size=(8, 9)) > 0.3).astype(np.float32)
     x = mi.TensorXf(motion)
     dr.enable_grad(x)
-    loss = flow_loss(x, mi.TensorXf(observed), mi.TensorXf(reliable))
+    loss = flow_loss(x, mi.TensorXf(observed), mi.TensorXf(reliable), reliable.size)
     error = np.linalg.norm(motion - observed, axis=-1)
     assert item(loss) == pytest.approx((error * reliable).mean(), rel=1e-3)
     dr.backward(loss)
@@ -127,13 +127,9 @@ def test_flow_loss__is_the_mean_endpoint_error():
 
 
 def test_flow_loss__has_a_finite_gradient_where_both_agree():
-    x = mi.TensorXf(np.ones((4, 4, 2), np.float32))
+    x = dr.ones(mi.TensorXf, (4, 4, 2))
     dr.enable_grad(x)
-    dr.backward(
-        flow_loss(
-            x, mi.TensorXf(np.ones((4, 4, 2), np.float32)), mi.TensorXf(np.ones((4, 4), np.float32))
-        )
-    )
+    dr.backward(flow_loss(x, dr.ones(mi.TensorXf, (4, 4, 2)), dr.ones(mi.TensorXf, (4, 4)), 16))
     assert np.asarray(dr.grad(x)).max() == 0
 
 
@@ -141,13 +137,13 @@ def test_mask_loss__is_the_mean_absolute_difference():
     rng = np.random.default_rng(4)
     confidence = rng.uniform(size=(6, 5, 1)).astype(np.float32)
     mask = rng.uniform(size=(6, 5)) > 0.5
-    loss = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
+    loss = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32)), mask.size))
     assert loss == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
 def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
     offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
-    assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(
+    assert item(offset_loss(mi.TensorXf(offset), 2.0, 7)) == pytest.approx(
         np.abs(offset).sum(1).mean() / 2, rel=1e-5
     )
 
@@ -163,7 +159,7 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
     y, x = np.mgrid[:height, :width]
     drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
     drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
-    region = Region(drawn)
+    region = Region.of(drawn)
     truth = np.float32(rng.uniform(size=(height, width, 3)))
     changed = (
         region.crop(truth)
@@ -213,7 +209,7 @@ def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
         )
         dr.eval(image)
         dr.enable_grad(image)
-        dr.backward(recon_loss(image, Target(np.asarray(image))))
+        dr.backward(recon_loss(image, Target(np.asarray(image)), 0.2))
         dr.eval(dr.grad(image))
         dr.sync_thread()
 

@@ -120,7 +120,3 @@ def test_find_neighbours__weighs_near_ones_more():
     weights = np.asarray(pairs.weights) * len(lengths)
     assert weights == pytest.approx(np.exp(-((lengths / REACH) ** 2)), rel=1e-4)
     assert np.asarray(pairs.difference @ np.ones(40)) == pytest.approx(np.zeros(200), abs=0)
-
-
-def test_find_neighbours__has_none_for_a_single_gaussian():
-    assert find_neighbours(to_gaussians(BEFORE).select(np.array([3])), EXTENT) is None

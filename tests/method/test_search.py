@@ -25,6 +25,7 @@ from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 SHIFT = np.float32([0.15, 0.05, 0.08])  # 12 px; the rod is 6 px wide
+CONFIG = SearchConfig()
 ROD = 24
 WALL = 1500
 MOVES = np.arange(ROD + WALL) < ROD
@@ -58,7 +59,7 @@ def still():
     return MotionStart(np.zeros((ROD + WALL, 3), np.float32), np.full(ROD + WALL, -2, np.float32))
 
 
-def searched(gaussians, start, views, visible, config=None):
+def searched(gaussians, start, views, visible, config=CONFIG):
     return search_motion(
         MotionProblem(gaussians, views, visible, np.random.default_rng(0)), start, config
     )

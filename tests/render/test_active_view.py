@@ -40,7 +40,7 @@ def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
     """Return the view of the static Gaussians, and the active Gaussians."""
     active = np.isin(np.arange(N), ACTIVE)
     view = make_active_view(
-        camera, Region(mask), gaussians.select(~active), CHANNELS, RenderConfig()
+        camera, Region.of(mask), gaussians.select(~active), CHANNELS, RenderConfig()
     )
     return view, gaussians.select(active)
 
@@ -83,6 +83,6 @@ def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, 
 
 def test_make_active_view__accepts_no_static_gaussians(camera, gaussians, mask):
     none = gaussians.select(np.zeros(0, int))
-    view = make_active_view(camera, Region(mask), none, CHANNELS, RenderConfig())
+    view = make_active_view(camera, Region.of(mask), none, CHANNELS, RenderConfig())
     full = rasterize(gaussians, camera, ("color",)).color
     assert np.array_equal(view.render(gaussians).color, view.crop(np.asarray(full)))

@@ -85,7 +85,7 @@ def test_rasterize__refuses_cameras_that_do_not_fit(gaussians):
     with pytest.raises(ValueError, match="got an empty sequence"):
         rasterize(gaussians, [])
     with pytest.raises(ValueError, match="`region` must be None with a sequence of cameras"):
-        rasterize(gaussians, [first], region=Region(np.ones((37, 45), bool)))
+        rasterize(gaussians, [first], region=Region.of(np.ones((37, 45), bool)))
 
 
 def test_rasterize__draws_no_gaussians_in_several_cameras(gaussians):

@@ -54,7 +54,7 @@ def test_rasterize__renders_on_a_region_a_new_attribute_of_the_table(scene):
     gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"])
     mask = np.zeros((camera.height, camera.width), bool)
     mask[9, 10] = True
-    region = Region(mask)
+    region = Region.of(mask)
     image = rasterize(gaussians, camera, ("roughness", "confidence"), region=region)
     assert_close(image["roughness"], image.confidence)
 

@@ -185,7 +185,7 @@ def test_depth_limit__on_a_region_equals_the_full_image(scene, limit):
     raw, camera = scene
     mask = np.zeros((camera.height, camera.width), bool)
     mask[5:9, 6:17] = True
-    region = Region(mask)
+    region = Region.of(mask)
     full = rasterize(to_gaussians(raw), camera, ("color",), depth_limit=limit).color
     part = rasterize(to_gaussians(raw), camera, ("color",), depth_limit=limit, region=region).color
     assert_close(part, region.crop(np.asarray(full)), atol=tol.IMAGE_ABS)

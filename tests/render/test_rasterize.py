@@ -243,7 +243,7 @@ def test_rasterize__refuses_a_pose_that_is_not_finite(scene, value, on_region):
     viewmat = np.float32(camera.viewmat)
     viewmat[2, 3] = value
     posed = replace(camera, viewmat=mi.TensorXf(viewmat))
-    region = Region(np.ones((camera.height, camera.width), bool)) if on_region else None
+    region = Region.of(np.ones((camera.height, camera.width), bool)) if on_region else None
     with pytest.raises(
         ValueError, match=rf"`camera.viewmat` must be finite, got {value} at \[2, 3\]"
     ):

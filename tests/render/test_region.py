@@ -57,7 +57,7 @@ def run(raw, camera, region=None, weight=None, config=None):
 def weight(camera: Camera, mask: np.ndarray) -> dict[str, np.ndarray]:
     """Random weights on the pixels of the region's blocks, 0 elsewhere."""
     rng = np.random.default_rng(3)
-    drawn = drawn_pixels(Region(mask), mask)
+    drawn = drawn_pixels(Region.of(mask), mask)
     sizes = {"color": 3, "motion": 2}
     return {name: rng.normal(size=(*mask.shape, sizes.get(name, 1))) * drawn for name in CHANNELS}
 
@@ -80,7 +80,7 @@ def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(
     raw, camera, mask, weight
 ):
     config = RenderConfig()
-    region = Region(mask, config)
+    region = Region.of(mask, config)
     assert region.num_blocks < 0.3 * (camera.width * camera.height) / 32
     images, grads = run(raw, camera, region, weight, config)
     full_images, full_grads = run(raw, camera, None, weight, config)
@@ -94,7 +94,7 @@ def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(
 
 def test_rasterize__blends_features_on_a_region(raw, camera, mask):
     rng = np.random.default_rng(0)
-    region = Region(mask)
+    region = Region.of(mask)
     values = np.float32(rng.normal(size=(len(raw["means"]), 5)))
 
     def run_features(**restriction):
@@ -127,7 +127,7 @@ def test_rasterize__equal_depths_keep_their_order(camera):
 
 def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
     rng = np.random.default_rng(1)
-    region = Region(mask)
+    region = Region.of(mask)
     tangents = []
     direction = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
     for where in (region, None):
@@ -150,8 +150,10 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
 
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
     raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
-    image = rasterize(Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region(mask))
-    pixels = Region(mask).crop(np.ones(mask.shape, bool))
+    image = rasterize(
+        Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region.of(mask)
+    )
+    pixels = Region.of(mask).crop(np.ones(mask.shape, bool))
     assert np.array_equal(
         np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1))
     )
@@ -160,7 +162,7 @@ def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
 
 
 def test_region__crop_and_uncropped_are_inverse(camera, mask):
-    region = Region(mask)
+    region = Region.of(mask)
     image = np.random.default_rng(0).normal(size=(*mask.shape, 3))
     result = region.uncropped(region.crop(image))[: mask.shape[0], : mask.shape[1]]
     assert (result[mask] == image[mask]).all()
@@ -175,7 +177,7 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
     def step(where):
         gaussians = Gaussians(**raw)
         dr.enable_grad(*gaussians.items().values())
-        image = rasterize(gaussians, camera, ("color",), region=Region(where))
+        image = rasterize(gaussians, camera, ("color",), region=Region.of(where))
         dr.backward(dr.sum(image.color, axis=None))
         dr.eval(dr.grad(gaussians.means))
         dr.sync_thread()
@@ -192,18 +194,13 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
 
 def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
     gaussians = Gaussians(**raw)
-    for bad in (np.zeros((4, 4), bool), np.ones((4, 4)), np.ones(4, bool)):
-        with pytest.raises(
-            ValueError, match=r"Region\(\): `mask` must be bool \[H, W\] with at least one pixel"
-        ):
-            Region(bad)
     with pytest.raises(ValueError, match="`region` must be of a 101x75 view with 8x4 blocks"):
-        rasterize(gaussians, camera, region=Region(mask[:, :-1]))
+        rasterize(gaussians, camera, region=Region.of(mask[:, :-1]))
     with pytest.raises(ValueError, match="got 101x75 with 4x4"):
-        rasterize(gaussians, camera, region=Region(mask, RenderConfig(block_width=4)))
+        rasterize(gaussians, camera, region=Region.of(mask, RenderConfig(block_width=4)))
     broken = raw | {"means": np.where(np.arange(360).reshape(120, 3) == 7, np.nan, raw["means"])}
     with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[2, 1\]"):
-        rasterize(Gaussians(**broken), camera, region=Region(mask))
+        rasterize(Gaussians(**broken), camera, region=Region.of(mask))
 
 
 @pytest.mark.parametrize("offset", range(4))
@@ -223,14 +220,6 @@ def test_rasterize__backward_reads_gradients_at_any_alignment(raw, offset):
     assert np.isfinite(np.asarray(dr.grad(gaussians.means))).all()
 
 
-def test_region__refuses_to_crop_an_image_of_another_size():
-    region = Region(np.ones((18, 21), bool))
-    with pytest.raises(
-        ValueError, match=r"`image` must be \[18, 21, ...\], got \[18, 22, 3\]; resize it"
-    ):
-        region.crop(np.zeros((18, 22, 3)))
-
-
 @pytest.mark.parametrize("size", [(37, 45), (64, 96)])
 def test_BlockGrid__counts_the_pixels_of_its_blocks(size):
     mask = np.random.default_rng(0).random(size) < 0.04
@@ -241,6 +230,6 @@ def test_BlockGrid__counts_the_pixels_of_its_blocks(size):
     expected = padded.reshape(rows, 4, columns, 8).sum(axis=(1, 3))
     np.testing.assert_array_equal(grid.counts(mask), expected)
     np.testing.assert_array_equal(
-        Region.of(grid, expected > 0).mask,
-        Region(mask, RenderConfig(block_width=8, block_height=4)).mask,
+        Region(grid, expected > 0).mask,
+        Region.of(mask, RenderConfig(block_width=8, block_height=4)).mask,
     )

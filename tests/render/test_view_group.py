@@ -51,7 +51,7 @@ def views_of(gaussians: Gaussians) -> list[ActiveView]:
         y, x = np.mgrid[: camera.height, : camera.width]
         mask = (x - 30) ** 2 + (y - 20) ** 2 < (10 + 5 * k) ** 2
         views.append(
-            make_active_view(camera, Region(mask), static, ("color", "motion"), RenderConfig())
+            make_active_view(camera, Region.of(mask), static, ("color", "motion"), RenderConfig())
         )
     none = make_active_view(
         cameras[1], views[1].region, static.select(slice(0)), (), RenderConfig()

@@ -33,7 +33,7 @@ from morgs_mi.method.flow_sources.flow_registry import (
     FramePair,
 )
 
-SUFFIXES = (".flo", ".exr")
+_SUFFIXES = (".flo", ".exr")
 
 _MAGIC = 202021.25
 _HEADER = np.dtype([("magic", "<f4"), ("width", "<i4"), ("height", "<i4")])
@@ -42,88 +42,16 @@ _CHANNELS = (("flow.X", "flow.Y"), ("X", "Y"), ("u", "v"), ("R", "G"))
 _UNKNOWN = 1e9
 
 
-class FlowFolder:
-    """Folder of flow files in the layout above.
-
-    Args:
-        folder: holds one folder per camera; files may be added later.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-    """
-
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-        if not self.folder.is_dir():
-            raise FileNotFoundError(
-                f"{folder}: expected a folder of flow files, found none; check the path."
-            )
-        self._listed: dict[Path, dict[int, Path]] = {}
-
-    def flows(
-        self, camera: str, frame: int, size: tuple[int, int]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flow from frame t to t - 1 on frame t's grid, and from t - 1 to t on frame t -
-        1's grid.
-
-        Args:
-            camera: name of the camera.
-            frame: t, from 1.
-            size: height and width of the camera's images.
-
-        Raises:
-            FileNotFoundError: a file or its folder is missing.
-            ValueError: a frame has two files, a flow has another size, or as `read_flow`.
-        """
-        flows = []
-        for direction, number in (("backward", frame), ("forward", frame - 1)):
-            folder = self.folder / camera / direction
-            if number not in self._listed.get(folder, {}):  # files may have been added since
-                content = listed(folder) if folder.is_dir() else ()
-                paths = [path for path in content if path.suffix.lower() in SUFFIXES]
-                numbers = frame_numbers(folder, [path.stem for path in paths]) if paths else ()
-                self._listed[folder] = dict(zip(numbers, paths, strict=True))
-            files = self._listed[folder]
-            if number not in files:
-                content = (
-                    f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
-                )
-                raise FileNotFoundError(
-                    f"{folder}: expected a .flo or .exr file of frame {number}, found {content}; "
-                    "name each file after the frame on whose grid its flow lives, counting from 0."
-                )
-            flow = read_flow(files[number])
-            if flow.shape[:2] != size:
-                rows, columns = flow.shape[:2]
-                raise ValueError(
-                    f"{files[number]}: expected {size[1]}x{size[0]} pixels as the images of "
-                    f"{camera} have, got {columns}x{rows}; compute the flow on undistorted and "
-                    "downscaled images."
-                )
-            flows.append(flow)
-        return flows[0], flows[1]
-
-
-def read_flow(path: str | Path) -> np.ndarray:
+def read_flow(path: Path) -> np.ndarray:
     """Return the flow [H, W, 2] in pixels, float32, of a `.flo` or EXR file.
 
     Raises:
-        FileNotFoundError: there is no such file.
         OSError: an EXR file cannot be read.
-        ValueError: another kind of file, a `.flo` file without its magic number or of another
-            length than its header states, an EXR file without exactly one known pair of channels,
-            or pixels without flow.
+        ValueError: a `.flo` file without its magic number or of another length than its header
+            states, an EXR file without exactly one known pair of channels, or pixels without flow.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(
-            f"read_flow(): `path` must end in {' or '.join(SUFFIXES)}, got {path.name!r}."
-        )
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a flow file, found none; check the path.")
     try:
-        flow = _read_flo(path) if suffix == ".flo" else _read_exr(path)
+        flow = _read_flo(path) if path.suffix.lower() == ".flo" else _read_exr(path)
         unknown = ~(np.abs(flow) < _UNKNOWN).all(axis=2)
         if unknown.any():
             y, x = np.argwhere(unknown)[0]
@@ -167,11 +95,45 @@ def _read_exr(path: Path) -> np.ndarray:
 
 
 @FLOW_SOURCES.register("files", "FOLDER")
-def _source(folder: str, config: FlowConfig) -> FlowSource:
-    flows = FlowFolder(folder).flows
+def flow_files(folder: str, config: FlowConfig) -> FlowSource:
+    """Return the flow of files in the layout above; files may be added later.
 
-    def source(pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
-        height, width = pair.image.shape[:2]
-        return flows(pair.camera, pair.frame, (height, width))
+    Raises:
+        FileNotFoundError: there is no such folder, or later no file of a frame.
+        ValueError: later, a frame has two files, a flow has another size than its images, or as
+            `read_flow`.
+    """
+    if not Path(folder).is_dir():
+        raise FileNotFoundError(
+            f"{folder}: expected a folder of flow files, found none; check the path."
+        )
+    known: dict[Path, dict[int, Path]] = {}
 
-    return source
+    def flow(pair: FramePair, direction: str, frame: int) -> np.ndarray:
+        place = Path(folder) / pair.camera / direction
+        if frame not in known.get(place, {}):  # files may have been added since
+            content = listed(place) if place.is_dir() else ()
+            paths = [path for path in content if path.suffix.lower() in _SUFFIXES]
+            numbers = frame_numbers(place, [path.stem for path in paths]) if paths else ()
+            known[place] = dict(zip(numbers, paths, strict=True))
+        files = known[place]
+        if frame not in files:
+            content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
+            raise FileNotFoundError(
+                f"{place}: expected a .flo or .exr file of frame {frame}, found {content}; name "
+                "each file after the frame on whose grid its flow lives, counting from 0."
+            )
+        vectors = read_flow(files[frame])
+        rows, columns = pair.image.shape[:2]
+        if vectors.shape != (rows, columns, 2):
+            raise ValueError(
+                f"{files[frame]}: expected {columns}x{rows} pixels as the images of {pair.camera} "
+                f"have, got {vectors.shape[1]}x{vectors.shape[0]}; compute the flow on undistorted "
+                "and downscaled images."
+            )
+        return vectors
+
+    return lambda pair: (
+        flow(pair, "backward", pair.frame),
+        flow(pair, "forward", pair.frame - 1),
+    )

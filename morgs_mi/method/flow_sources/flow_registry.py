@@ -12,12 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge
 
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import NonNegative, NonNegativeInt, config_class
 from morgs_mi.method.method_registry import Registry
 
 
@@ -29,15 +27,15 @@ class FlowConfig:
         ValueError: a number is out of range.
     """
 
-    fine_width: Annotated[int, Ge(0)] = 480
+    fine_width: NonNegativeInt = 480
     """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half
     resolution.
     """
-    consistency_relative: Annotated[float, Ge(0)] = 0.01
+    consistency_relative: NonNegative = 0.01
     """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both
     flows.
     """
-    consistency_absolute: Annotated[float, Ge(0)] = 0.5
+    consistency_absolute: NonNegative = 0.5
     """Forward-backward check: tolerated squared mismatch of the shortest flows, px^2."""
 
 

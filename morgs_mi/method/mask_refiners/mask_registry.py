@@ -11,12 +11,10 @@ it is imported.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge
 
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import Count, NonNegative, config_class
 from morgs_mi.method.method_registry import Registry
 
 
@@ -28,18 +26,18 @@ class MaskConfig:
         ValueError: a number is out of range.
     """
 
-    threshold_mads: Annotated[float, Ge(0)] = 4.0
+    threshold_mads: NonNegative = 4.0
     """Speed above which a pixel moves: this many median absolute deviations above the median."""
-    floor: Annotated[float, Ge(0)] = 0.5
+    floor: NonNegative = 0.5
     """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
     proportional to the width, as the motion of a scene is."""
-    working_width: Annotated[int, Ge(1)] = 320
+    working_width: Count = 320
     """Width in pixels to which GrabCut and superpixels reduce an image. Their cost grows with the
     number of pixels, and a mask needs the object's outline, not its details."""
-    superpixel_share: Annotated[float, Ge(0)] = 0.75
+    superpixel_share: NonNegative = 0.75
     """Share of a superpixel that must lie in the flow mask. Flow bleeds outwards onto the static
     surroundings of an object, all of which a bare majority would include."""
-    prompts: Annotated[int, Ge(1)] = 16
+    prompts: Count = 16
     """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
     of the decoder; the smaller ones stay as they are in the flow mask."""
 

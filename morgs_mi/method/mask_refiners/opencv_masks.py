@@ -26,9 +26,7 @@ _SLIC_ITERATIONS = 5
 _COMPACTNESS = 10.0
 
 
-def refine_mask(
-    image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None
-) -> np.ndarray:
+def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.ndarray:
     """Return the mask of the objects [H, W] bool that a motion mask lies on, by GrabCut on colours.
 
     GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004) starts from the mask with specks removed
@@ -39,9 +37,8 @@ def refine_mask(
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
         mask: [H, W] bool.
-        config: settings of GrabCut; None: the defaults.
+        config: settings of GrabCut.
     """
-    config = config or MaskConfig()
     clean = clean_mask(mask)
     small = thumbnail(byte_values(image), config.working_width)
     seed = cv2.resize(clean.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -63,9 +60,7 @@ def refine_mask(
     return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 
-def vote_superpixels(
-    image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None
-) -> np.ndarray:
+def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.ndarray:
     """Return the mask of the superpixels [H, W] bool three quarters of which are in a motion mask.
 
     SLIC (Achanta et al., PAMI 2012) on colours in Lab. Flow that bleeds over an edge is removed,
@@ -76,9 +71,8 @@ def vote_superpixels(
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
         mask: [H, W] bool.
-        config: settings of the superpixels; None: the defaults.
+        config: settings of the superpixels.
     """
-    config = config or MaskConfig()
     small = thumbnail(byte_values(image), config.working_width)
     if min(small.shape[:2]) < 2 * _SIDE:
         return mask

@@ -18,13 +18,13 @@ def test_refine_mask__recovers_an_object_from_a_part_of_it():
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     partial = disc.copy()
     partial[120:140] = False
-    assert iou(refine_mask(image, partial), disc) > 0.95 > iou(partial, disc)
+    assert iou(refine_mask(image, partial, MaskConfig()), disc) > 0.95 > iou(partial, disc)
 
 
 def test_vote_superpixels__removes_flow_that_bleeds_over_an_edge():
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     bleeding = cv2.dilate(disc.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    voted = vote_superpixels(image, bleeding)
+    voted = vote_superpixels(image, bleeding, MaskConfig())
     assert iou(voted, disc) > 0.9 > iou(bleeding, disc)
     assert voted[disc].mean() > 0.98
 
@@ -33,7 +33,7 @@ def test_vote_superpixels__removes_specks():
     _, image, _ = moving_disc(240, 320, (0, 0))
     specks = np.zeros((240, 320), bool)
     specks[10:230:12, 10:310:12] = True
-    assert not vote_superpixels(image, specks).any()
+    assert not vote_superpixels(image, specks, MaskConfig()).any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (40, 30), (700, 20)])
@@ -45,7 +45,7 @@ def test_refine_mask__and_vote_superpixels_accept_any_mask(refine, size):
     masks = {name: np.full(size, name == "all") for name in ("nothing", "speck", "all", "half")}
     masks["speck"][center] = True
     masks["half"][rows < size[0] // 2] = True
-    refined = {name: refine(image, mask) for name, mask in masks.items()}
+    refined = {name: refine(image, mask, MaskConfig()) for name, mask in masks.items()}
     assert {(mask.shape, mask.dtype) for mask in refined.values()} == {(size, np.dtype(bool))}
     assert not refined["nothing"].any()
     assert refined["all"].all()
@@ -71,6 +71,6 @@ def test_clean_mask__removes_specks_and_closes_holes():
 def test_mask_config__every_setting_acts(refine, settings):
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     mask = np.roll(disc, (25, 19), (0, 1))
-    usual = refine(image, mask)
+    usual = refine(image, mask, MaskConfig())
     for name, value in settings.items():
         assert not np.array_equal(refine(image, mask, MaskConfig(**{name: value})), usual), name
