@@ -65,7 +65,9 @@ class CameraSource:
         times = ClipTimes(indices, positions - indices, 0.0, self.times.rate)
         return replace(self, times=times)
 
-    def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
+    def images(
+        self, camera: Camera, start: int, stop: int | None
+    ) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the timestamps start..stop-1, with an error in place of a
         missing image.
         """
@@ -103,9 +105,9 @@ class CameraSource:
         size = (camera.width, camera.height)
         if image.shape[1::-1] != size:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        return (
-            image if self.display_exposure is None else display_image(image, self.display_exposure)
-        )
+        if self.display_exposure is not None:
+            image = display_image(image, self.display_exposure)
+        return image
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""

@@ -166,9 +166,8 @@ class Capture:
         """Return the capture with images of 8 bits: linear light as a display shows it."""
         if self.display_exposure is None:
             return self
-        sources = tuple(
-            replace(source, display_exposure=self.display_exposure) for source in self._sources
-        )
+        stops = self.display_exposure
+        sources = tuple(replace(source, display_exposure=stops) for source in self._sources)
         return replace(self, _sources=sources, display_exposure=None)
 
     def with_cameras(
@@ -185,22 +184,13 @@ class Capture:
         if not np.any(distortions):
             return rig
         radial_terms = tuple((float(k1), float(k2)) for k1, k2 in distortions)
-        views = zip(
-            self._sources,
-            self.at_recorded_size().cameras,
-            rig.at_recorded_size().cameras,
-            radial_terms,
-            strict=True,
-        )
-        sources = tuple(
-            replace(
-                source,
-                undistortion=undistortion(camera, source.lens, (refined, Lens("RADIAL", terms))),
-            )
-            for source, camera, refined, terms in views
-        )
+        rigs = (self.at_recorded_size().cameras, rig.at_recorded_size().cameras)
+        sources = []
+        for source, camera, refined, terms in zip(self._sources, *rigs, radial_terms, strict=True):
+            maps = undistortion(camera, source.lens, (refined, Lens("RADIAL", terms)))
+            sources.append(replace(source, undistortion=maps))
         masks = _masks(sources, rig.cameras)
-        return replace(rig, masks=masks, _sources=sources, distortions=radial_terms)
+        return replace(rig, masks=masks, _sources=tuple(sources), distortions=radial_terms)
 
     def holding_out(self, views: int | str | Sequence[int | str] | None) -> Capture:
         """Return the capture with other held-out cameras, by indices or names; None for none.
@@ -275,26 +265,20 @@ class Capture:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """
-        return self._sources[view].images(self.cameras[view], start, self._stop(stop))
-
-    def _stop(self, stop: int | None) -> int:
-        """Return the end of a range of frames, by default of all."""
-        return self.num_frames if stop is None else min(stop, self.num_frames)
+        return self._sources[view].images(self.cameras[view], start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Return the cameras of a stream of this capture with the delays and readouts of the
         capture's cameras.
         """
-        pairs = zip(cameras, self.cameras, strict=True)
         return tuple(
             replace(camera, delay=original.delay, readout=original.readout)
-            for camera, original in pairs
+            for camera, original in zip(cameras, self.cameras, strict=True)
         )
 
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
-        stop = self._stop(stop)
         streams = [
             s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)
         ]
@@ -337,7 +321,7 @@ def _masks(
     sources: Sequence[CameraSource], cameras: Sequence[Camera]
 ) -> tuple[np.ndarray | None, ...]:
     """Return the masks of the valid pixels of cameras, None where all are valid."""
-    return tuple(source.mask(camera) for source, camera in zip(sources, cameras, strict=True))
+    return tuple(map(CameraSource.mask, sources, cameras))
 
 
 def load_capture(
@@ -387,21 +371,21 @@ def load_capture(
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     masks = calibration.masks or ((),) * len(readers)
-    clips = zip(readers, calibration.lenses, recorded, masks, common.clips, strict=True)
-    sources = tuple(CameraSource.of(*clip) for clip in clips)
-    readout = settings.get("readout", 0.0)
-    if isinstance(readout, dict):
-        check_names(path / CAPTURE, "readout", readout, every.names)
-        readouts = [readout.get(name, 0.0) for name in names]
-    else:
-        readouts = [readout] * len(names)
+    sources = tuple(
+        map(CameraSource.of, readers, calibration.lenses, recorded, masks, common.clips)
+    )
+    readouts: Any = settings.get("readout", 0.0)
+    if not isinstance(readouts, dict):
+        readouts = dict.fromkeys(names, readouts)
+    check_names(path / CAPTURE, "readout", readouts, every.names)
+    readouts = [readouts.get(name, 0.0) for name in names]
     cameras = _downscaled_cameras(recorded, downscale, common.clips, readouts)
     cameras = with_near_planes(cameras, calibration.points, reading.near)
+    notes = [*common.notes, *(note for source in sources for note in source.notes)]
     photos = [clip[0] for clip in calibration.clips if isinstance(clip, tuple) and len(clip) == 1]
-    notes = ()
     if len(photos) == len(readers) and len({file.parent for file in photos}) == 1:
-        notes = (
-            f"{len(photos)} photos of a static scene, one per camera; a recording has {EXAMPLE}",
+        notes.append(
+            f"{len(photos)} photos of a static scene, one per camera; a recording has {EXAMPLE}"
         )
     capture = Capture(
         path=path,
@@ -418,11 +402,7 @@ def load_capture(
         downscale=downscale,
         layout=reader.name,
         reading=reading,
-        notes=(
-            *common.notes,
-            *(note for source in sources for note in source.notes),
-            *notes,
-        ),
+        notes=tuple(notes),
         origin=calibration.origin,
     )
     if any(reader.has_light for reader in readers):
@@ -442,6 +422,7 @@ def _at_clip_sizes(
         ValueError: a clip has another aspect ratio than its camera.
     """
     recorded = []
+    scaled = []
     for camera, reader in zip(cameras, readers, strict=True):
         width = reader.width
         height = reader.height
@@ -453,8 +434,9 @@ def _at_clip_sizes(
                 "the size of the images."
             )
         recorded.append(camera.resized(width, height))
-    pairs = zip(cameras, recorded, strict=True)
-    if scaled := [new for old, new in pairs if (new.width, new.height) != (old.width, old.height)]:
+        if (width, height) != (camera.width, camera.height):
+            scaled.append(recorded[-1])
+    if scaled:
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
             "intrinsics are scaled.",
@@ -472,23 +454,20 @@ def _downscaled_cameras(
     """Return the downscaled cameras of clips, with their delays and readouts: `readouts` are in
     frames of the clips, the cameras' in timestamps.
     """
-    cameras = []
-    for camera, times, readout in zip(recorded, clips, readouts, strict=True):
-        if downscale != 1:
-            camera = camera.resized(
-                max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale))
-            )
-        delay = times.delay / times.rate
-        cameras.append(replace(camera, delay=delay, readout=readout / times.rate))
-    if downscale > 1 and _shortest_side(cameras) < MIN_SIDE:
-        largest = _shortest_side(recorded) / MIN_SIDE
+    shortest = min(min(camera.width, camera.height) for camera in recorded)
+    if downscale > 1 and round(shortest / downscale) < MIN_SIDE:
+        largest = shortest / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
         raise ValueError(
             f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
             f"side, got {downscale:g}; {remedy}."
         )
+    cameras = []
+    for camera, times, readout in zip(recorded, clips, readouts, strict=True):
+        if downscale != 1:
+            camera = camera.resized(
+                round(camera.width / downscale), round(camera.height / downscale)
+            )
+        delay = times.delay / times.rate
+        cameras.append(replace(camera, delay=delay, readout=readout / times.rate))
     return cameras
-
-
-def _shortest_side(cameras: Sequence[Camera]) -> int:
-    return min(min(camera.width, camera.height) for camera in cameras)

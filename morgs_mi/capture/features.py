@@ -8,6 +8,7 @@ matches. `guided_matching` uses them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -24,6 +25,8 @@ _RATIO = 0.8
 _ALL_PAIRS = 24
 _NEIGHBOURS = 8
 _MIN_MATCHES = 16
+# Degrees, the smallest accepted spread of the views of a point.
+MIN_ANGLE = 1.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,11 @@ class Match:
 
     views: tuple[int, int]  #: Indices of the two views.
     features: np.ndarray  #: [M, 2] int, index of the feature in each view.
+
+    def pixels(self, features: Sequence[Features]) -> list[np.ndarray]:
+        """Return the positions [M, 2] of the matched features in each of the two views."""
+        pairs = zip(self.views, self.features.T, strict=True)
+        return [features[view].points[rows] for view, rows in pairs]
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,7 @@ class Tracks:
     @property
     def count(self) -> int:
         """Number of tracks."""
-        return int(self.ids.max()) + 1 if len(self.ids) else 0
+        return int(self.ids.max(initial=-1)) + 1
 
     def mean_colors(self) -> np.ndarray:
         """Return the mean colour of each track [P, 3]."""
@@ -80,8 +88,12 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none
     without an image.
     """
+    no_points = np.zeros((0, 2))
+    none = Features(
+        no_points, np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), no_points
+    )
     if image is None:
-        return _no_features()
+        return none
     height, width = image.shape[:2]
     size = reduced_size(width, height, _DETECTION_PIXELS)
     grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
@@ -91,7 +103,7 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
-        return _no_features()
+        return none
     pixel_scale = width / size[0], height / size[1]
     points = (np.array([k.pt for k in keypoints]) + 0.5) * pixel_scale
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic
@@ -102,11 +114,6 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     angles, sizes = np.array([(np.deg2rad(k.angle), k.size) for k in keypoints]).T
     axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return Features(points, descriptors, colors, axes * pixel_scale)
-
-
-def _no_features() -> Features:
-    points = np.zeros((0, 2))
-    return Features(points, np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), points)
 
 
 def reduced_size(width: int, height: int, pixels: float) -> tuple[int, int]:
@@ -134,10 +141,8 @@ def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list
     matches = []
     for i, j in combinations(range(count), 2):
         if min(ranks[i, j], ranks[j, i]) <= neighbours:
-            pairs = _matches(features[i], features[j])
-            if len(pairs):
-                matches.append(Match((i, j), pairs))
-    return matches
+            matches.append(Match((i, j), _matches(features[i], features[j])))
+    return [match for match in matches if len(match.features)]
 
 
 def _matches(a: Features, b: Features) -> np.ndarray:
@@ -146,14 +151,12 @@ def _matches(a: Features, b: Features) -> np.ndarray:
     if min(len(a.points), len(b.points)) < 2:
         return none
     pairs = mutual_neighbours(descriptor_distances(a, b))
-    if len(pairs) < _MIN_MATCHES:
-        return none
-    x = a.points[pairs[:, 0]]
-    y = b.points[pairs[:, 1]]
-    try:
-        _, inliers = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
-    except cv2.error:  # raised for some matches that fit no geometry
-        return none
+    inliers = None
+    if len(pairs) >= _MIN_MATCHES:
+        x = a.points[pairs[:, 0]]
+        y = b.points[pairs[:, 1]]
+        with suppress(cv2.error):  # raised for some matches that fit no geometry
+            _, inliers = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
     if inliers is None or np.count_nonzero(inliers) < _MIN_MATCHES:
         return none
     return pairs[inliers.ravel() > 0]
@@ -184,21 +187,18 @@ def reprojection_errors(
     A match is triangulated from its two features. Its error is the mean distance of the point's
     projections from the features; it is infinite for a point behind a camera.
     """
-    pixels = np.concatenate(
-        [features[v].points[match.features[:, k]] for k, v in enumerate(match.views)]
-    )
+    pixels = np.concatenate(match.pixels(features))
     points = intersect_pairs(pixels, match.views, cameras)
     views = np.repeat(match.views, len(points))
     errors = _distances(np.tile(points, (2, 1)), views, pixels, cameras)
-    return errors.reshape(2, len(points)).mean(0)
+    return errors.reshape(2, -1).mean(0)
 
 
 def triangulate(
     matches: Sequence[Match],
     features: Sequence[Features],
     cameras: Sequence[Camera],
-    max_error: float = 2.0,
-    min_angle: float = 1.0,
+    max_error: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangulated points [P, 3] float32, world units, and their colours [P, 3] in
     [0, 1].
@@ -208,28 +208,17 @@ def triangulate(
         features: per view.
         cameras: per view.
         max_error: largest distance of a point's projection from any of its features, px.
-        min_angle: smallest accepted angle between the rays to a point, degrees.
     """
-    errors = [reprojection_errors(match, features, cameras) for match in matches]
-    close = [
-        replace(match, features=match.features[error <= max_error])
-        for match, error in zip(matches, errors, strict=True)
-    ]
+    close = []
+    for match in matches:
+        good = reprojection_errors(match, features, cameras) <= max_error
+        close.append(replace(match, features=match.features[good]))
     tracks = join_matches(close, features)
-    if not tracks.count:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
-    good = _largest(distances, tracks.ids, len(points)) <= max_error
-    good &= _widest_angles(points, tracks.ids, tracks.views, cameras) >= min_angle
+    good = _widest_angles(points, tracks.ids, tracks.views, cameras) >= MIN_ANGLE
+    good[tracks.ids[distances > max_error]] = False
     return points[good].astype(np.float32), tracks.mean_colors()[good].astype(np.float32)
-
-
-def _largest(values: np.ndarray, track: np.ndarray, count: int) -> np.ndarray:
-    """Return the largest of the values [n] of each of `count` tracks, at least 0."""
-    largest = np.zeros(count)
-    np.maximum.at(largest, track, values)
-    return largest
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:
@@ -270,11 +259,8 @@ def intersect(
     V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
     V[:, :, 3] = (V[:, :, :3] @ middle + V[:, :, 3]) / scale
     V = V[views]
-    x = np.empty_like(pixels)  # at depth 1
-    for view in np.unique(views):
-        of_view = views == view
-        K = cameras[view].K
-        x[of_view] = (pixels[of_view] - K[:2, 2]) / np.diag(K)[:2]
+    K = np.array([camera.K for camera in cameras])[views]
+    x = (pixels - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]  # at depth 1
     rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
     system = np.zeros((count, 4, 4))
     np.add.at(system, track, np.einsum("kri,krj->kij", rows, rows))
@@ -320,7 +306,9 @@ def _widest_angles(
         rays = _directions(points[track] - positions)
         mean = _directions(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))
         angle = np.rad2deg(np.arccos(np.clip((rays * mean[track]).sum(1), -1, 1)))
-    return 2 * _largest(np.nan_to_num(angle), track, len(points))
+    widest = np.zeros(len(points))
+    np.maximum.at(widest, track, np.nan_to_num(angle))
+    return 2 * widest
 
 
 def _directions(vectors: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     """Return the larger distance of two pixel positions, [K, 2] and [L, 2], from each other's
     lines, [K, L], px.
     """
-    centres = np.array([a.position, b.position], np.float64)
+    centres = np.array([a.position, b.position])
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
     fundamental = _fundamental(a, b)
@@ -69,8 +69,7 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
 def _fundamental(a: Camera, b: Camera) -> np.ndarray:
     """Return the fundamental matrix [3, 3], by which a pixel of `a` has its line in `b`."""
     relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
-    tx, ty, tz = relative[:3, 3]
-    essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ relative[:3, :3]
+    essential = np.cross(relative[:3, 3], relative[:3, :3], axisb=0, axisc=0)
     return np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
 
 
@@ -78,7 +77,7 @@ def _patches_agree(
     a: Features, b: Features, pairs: np.ndarray, first: Camera, second: Camera
 ) -> np.ndarray:
     """Return whether the patches of each pair [M, 2] agree in size and orientation, [M]."""
-    pixels = np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]])
+    pixels = np.concatenate(Match((0, 1), pairs).pixels((a, b)))
     points = intersect_pairs(pixels, (0, 1), (first, second))
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = _carried(points, a.axes[pairs[:, 0]], first, second)

@@ -65,10 +65,9 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
             f"the camera model {model} takes {count} parameters of at most {LARGEST:g}, got "
             f"{len(params)}: {[*params][:count]}; calibrate again."
         )
-    fx = params[0]
-    fy = params[focals - 1]
-    cx, cy = params[focals : focals + 2]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
+    K = np.eye(3)
+    K[[0, 1], [0, 1]] = params[:focals]
+    K[:2, 2] = params[focals : focals + 2]
     return Lens(model, tuple(map(float, params[focals + 2 :]))), K
 
 

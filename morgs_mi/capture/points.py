@@ -49,14 +49,13 @@ def match_capture(
     """
     capture = capture.displayed().at_recorded_size()
     images = next(capture.partial_frames(0, 1)).images
-    count = len(capture.cameras)
     progress = progress or (lambda done, count: None)
     features = []
-    for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
-        progress(done, count)
+    for image, mask in zip(images, capture.masks, strict=True):
+        progress(len(features), len(images))
         features.append(detect(image, mask))
     matches = match_views(features, capture.cameras)
-    progress(count, count)
+    progress(len(images), len(images))
     return SharedFeatures(tuple(features), tuple(matches))
 
 
@@ -91,14 +90,12 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
     sparse = triangulate_points(capture, shared)
     recorded = capture.at_recorded_size()
     images = next(recorded.displayed().partial_frames(0, 1)).images
-    views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
-    points, colors = stereo_points(
-        [recorded.cameras[v] for v, _ in views],
-        [image for _, image in views],
-        [recorded.masks[v] for v, _ in views],
-        sparse.points,
-        rng_of(seed, Stream.POINTS),
-    )
+    views = [
+        (recorded.cameras[v], image, recorded.masks[v])
+        for v in capture.train_views
+        if (image := images[v]) is not None
+    ]
+    points, colors = stereo_points(views, sparse.points, rng_of(seed, Stream.POINTS))
     points = np.concatenate([sparse.points, points])
     colors = np.concatenate([sparse.point_colors, colors])
     return replace(capture, points=points, point_colors=colors)

@@ -42,9 +42,7 @@ _LEAST_DEPTH = 0.2
 
 
 def stereo_points(
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
+    images: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]],
     scene_points: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -52,20 +50,21 @@ def stereo_points(
     close.
 
     Args:
-        cameras: C views.
-        images: per view uint8 [H, W, 3], RGB.
-        masks: per view the mask of valid pixels [H, W] bool, or None.
+        images: per view its camera, its image uint8 [H, W, 3], RGB, and the mask of valid pixels
+            [H, W] bool, or None.
         scene_points: points [K, 3] of the scene, which limit the depths.
         rng: random generator for the selection of points.
     """
-    views = [_View.of(*view) for view in zip(cameras, images, masks, strict=True)]
-    batches = [np.zeros((0, 6))]
+    views = [_View.of(*image) for image in images]
+    cameras = [camera for camera, _, _ in images]
+    batches = [np.zeros((0, 6), np.float32)]
     for i, j in _neighbours(cameras, scene_points):
         points = _matched(views[i], views[j], _depth_range(cameras, i, scene_points))
         others = [view for k, view in enumerate(views) if k not in (i, j)]
-        batches.append(_some_confirmed(rng.permutation(points), others))
+        points = _some_confirmed(rng.permutation(points), others)
+        batches.append(points.astype(np.float32))
     points, colors = np.split(np.concatenate(batches), 2, axis=1)
-    return points.astype(np.float32), colors.astype(np.float32)
+    return points, colors
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,8 @@ class _Rectified:
         behind the other.
         """
         right = b.position - a.position
-        right = right / float(np.linalg.norm(right))
+        baseline = float(np.linalg.norm(right))
+        right = right / baseline
         forward = a.viewmat[2, :3] + b.viewmat[2, :3]
         forward = forward - forward @ right * right
         forward /= max(float(np.linalg.norm(forward)), 1e-12)
@@ -150,22 +150,22 @@ class _Rectified:
         # The images have the rows that both views have.
         (ax, ay), (bx, by) = ((rays[:, :2] / rays[:, 2:]).T for rays in corners)
         top = max(ay.min(), by.min())
-        bottom = min(ay.max(), by.max())
-        size = int(np.ceil(max(np.ptp(ax), np.ptp(bx)))), int(np.ceil(bottom - top))
+        width = max(np.ptp(ax), np.ptp(bx))
+        size = int(np.ceil(width)), int(np.ceil(min(ay.max(), by.max()) - top))
         starts = (ax.min(), bx.min(), top)
         homographies = [
             _shift(-0.5, -0.5) @ (_shift(-start, -top) @ H) @ _shift(0.5, 0.5)
             for start, H in zip(starts, to_plane, strict=False)
         ]
-        baseline = float(np.linalg.norm(b.position - a.position))
         return cls(axes, focal, baseline, homographies, starts, size)
 
 
 def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     """Return the points of a pair of views and their colours [P, 6], at depths in a range."""
+    none = np.zeros((0, 6))
     rig = _Rectified.of(a.camera, b.camera)
     if rig is None:
-        return np.zeros((0, 6))
+        return none
     # The lowest disparity, and the number of disparities, of these depths.
     product = rig.focal * rig.baseline
     shift = rig.corners[1] - rig.corners[0]  # disparity of infinitely distant points, px
@@ -175,7 +175,7 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     # Strongly converging cameras have no useful plane in common.
     width, height = rig.size
     if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.valid.size:
-        return np.zeros((0, 6))
+        return none
     left, right = map(cv2.warpPerspective, (a.image, b.image), rig.homographies, [rig.size] * 2)
     forth = _disparity(left, right, lowest, count)
     back = _disparity(right, left, 1 - lowest - count, count)
@@ -183,27 +183,20 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
         cv2.warpPerspective(view.valid, H, rig.size, flags=cv2.INTER_NEAREST) > 0
         for view, H in zip((a, b), rig.homographies, strict=True)
     ]
-    mask = _consistency_mask(forth, back, valid[1]) & valid[0]
-    mask &= (forth >= lowest) & (forth - shift > 0)
-    rows, columns = np.nonzero(mask)
-    depth = product / (forth[mask] - shift)
+    # The pixels with a partner in the other image, which is valid and has them as its partner.
+    rows, columns = np.nonzero(valid[0] & (forth >= lowest) & (forth - shift > 0))
+    disparity = forth[rows, columns]
+    partner = np.round(columns - disparity).astype(int)
+    place = np.clip(partner, 0, width - 1)
+    agree = np.abs(disparity + back[rows, place]) <= _MAX_DIFFERENCE
+    good = agree & (partner == place) & valid[1][rows, place]
+    rows = rows[good]
+    columns = columns[good]
+    depth = product / (disparity[good] - shift)
     x = (columns + 0.5 + rig.corners[0]) * depth / rig.focal
     y = (rows + 0.5 + rig.corners[2]) * depth / rig.focal
     points = np.stack([x, y, depth], axis=1) @ rig.axes + a.camera.position
-    return np.concatenate([points, left[mask] / 255.0], axis=1)
-
-
-def _consistency_mask(forth: np.ndarray, back: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the mask [H, W] of the pixels whose partner in the other image is valid and has them
-    as its partner, from the disparities of both directions.
-    """
-    height, width = forth.shape
-    rows, columns = np.mgrid[:height, :width]
-    partner = np.round(columns - forth).astype(int)
-    has_partner = (partner >= 0) & (partner < width)
-    partner = np.clip(partner, 0, width - 1)
-    agree = np.abs(forth + back[rows, partner]) <= _MAX_DIFFERENCE
-    return agree & has_partner & valid[rows, partner]
+    return np.concatenate([points, left[rows, columns] / 255.0], axis=1)
 
 
 def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:

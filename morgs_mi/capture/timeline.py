@@ -113,11 +113,24 @@ def timeline(
             camera or has an offset that is not finite.
     """
     check_names(path, "offset", config.offset, names)
-    numbers = _align_numbers(path, names, readers, config.trim, config.offset)
-    for note in numbers.notes:
+    exact, notes = _by_numbers(path, names, readers, config, _clocks(names, readers, config, fps))
+    for note in notes:
         _LOG.warning("%s: %s", path, note)
-    exact = _clocks(names, readers, config, fps, numbers)
-    clocks, timestamps = _timestamps(path, names, readers, config, exact, max_frames)
+    if config.trim or config.offset:
+        clocks = _without_drift(exact, readers, max_frames)
+        timestamps = _common_timestamps(path, names, readers, config, clocks)[:max_frames]
+    else:
+        clocks = replace(exact, rates=np.ones(len(readers)))
+        timestamps = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
+        # Frames with the same index must be simultaneous.
+        drift = np.ptp(exact.rates) * (len(timestamps) - 1)
+        if drift > _NEAR:
+            rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
+            raise ValueError(
+                f"{path}: all cameras must have the same frame rate, got {rates}, up to "
+                f"{drift:.1f} frames apart; use the lowest one with --trim, or set `fps` in "
+                "capture.json."
+            )
     positions = clocks.offsets[:, None] + clocks.rates[:, None] * timestamps
     offsets = [config.offset.get(name, 0) for name in names]
     clips = list(map(_clip_times, readers, positions, clocks.rates.tolist(), offsets))
@@ -126,11 +139,18 @@ def timeline(
         for c, clip in enumerate(clips):
             far = np.abs(_image_positions(readers[c], clip, positions[c]) - positions[c]) > _NEAR
             clips[c] = replace(clip, frame_indices=np.where(far, -1, clip.frame_indices))
-    _warn_apart(path, readers, clips, positions, exact)
+    # Images of one timestamp that are apart, by the clips' clocks.
+    places = np.array(list(map(_image_positions, readers, clips, positions)))
+    times = (places - exact.offsets[:, None]) / exact.rates[:, None]
+    has_frame = np.stack([clip.frame_indices >= 0 for clip in clips])
+    latest = np.where(has_frame, times, -np.inf).max(axis=0)
+    earliest = np.where(has_frame, times, np.inf).min(axis=0)
+    spread = float(np.max(latest - earliest, initial=0)) / exact.fps
+    if spread > 1e-3:
+        _LOG.warning("%s: images of one timestamp are up to %.1f ms apart.", path, 1e3 * spread)
     unchanged = not any(config.offset.values()) and all(
         np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices))) for clip in clips
     )
-    notes = [*numbers.notes]
     for reader, clip in zip(readers, clips, strict=True):
         if reader.positions is not None and reader.fps:
             frames = clip.frame_indices[clip.frame_indices >= 0]
@@ -142,54 +162,46 @@ def timeline(
                 f"{1e3 * late:.1f} ms off; each timestamp has the frame nearest in time: {repeats} "
                 f"repeat one, {len(timestamps) - len(frames)} have none."
             )
-    return Timeline(tuple(clips), clocks.fps, unchanged, tuple(notes))
+    return Timeline(tuple(clips), exact.fps, unchanged, tuple(notes))
 
 
-@dataclass(frozen=True)
-class _ImageNumbers:
-    """Alignment of clips by the numbers of their images: image o + r t shows timestamp t."""
-
-    offsets: np.ndarray  #: o of each clip [C].
-    rates: np.ndarray  #: r of each clip [C].
-    #: Time between two timestamps, in frames of the clip with the most frames per time.
-    interval: float = 1.0
-    notes: tuple[str, ...] = ()  #: A sentence for each assumption.
-
-
-def _align_numbers(
+def _by_numbers(
     path: Path,
     names: Sequence[str],
     readers: Sequence[FrameReader],
-    trim: bool,
-    offset: Mapping[str, float],
-) -> _ImageNumbers:
-    """Return the alignment of clips by the numbers of their images, without `trim` by `offset`."""
+    config: ReadConfig,
+    clocks: _Clocks,
+) -> tuple[_Clocks, list[str]]:
+    """Return the clocks of clips by the numbers of their images, too, and a sentence for each
+    assumption.
+    """
     numbers = {
         c: r.numbers
         for c, r in enumerate(readers)
         if isinstance(r, FolderReader) and r.numbers is not None
     }
     groups = counting_together(numbers)
-    notes: tuple[str, ...] = ()
+    notes = []
     if len(groups) > 1 and any(len(clip_numbers) > 1 for clip_numbers in numbers.values()):
         table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
-        notes = (
+        notes.append(
             f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin "
-            "at the same time.",
+            "at the same time."
         )
-    by_position = _ImageNumbers(np.zeros(len(readers)), np.ones(len(readers)), notes=notes)
     different = [
         group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1
     ]
     if not different:
-        return by_position
+        return clocks, notes
     table = "; ".join(_table(names, numbers, group) for group in different)
-    if offset and not trim:
-        note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
-        return replace(by_position, notes=(*notes, note))
+    if config.offset and not config.trim:
+        notes.append(
+            f"Images are aligned by their positions and --offset, not by their numbers: {table}."
+        )
+        return clocks, notes
     group = {c: numbers[c] for c in different[0]}
     common = sorted(set.intersection(*map(set, group.values()))) if len(different) == 1 else []
-    if not trim or not common:
+    if not config.trim or not common:
         remedy = f"the {len(common)} common ones with --trim, " if common else ""
         raise ValueError(
             f"{path}: images with the same number must be simultaneous and all cameras must have "
@@ -197,7 +209,7 @@ def _align_numbers(
             "out the cameras that lack an image, or the positions of the images in place of "
             f"their numbers with --offset {names[different[0][0]]} 0."
         )
-    note = (
+    notes.append(
         f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
         "all cameras have."
     )
@@ -207,7 +219,12 @@ def _align_numbers(
     clips = [group.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
     offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
     rates = np.array([lcm(*steps) / clip.step for clip in clips])
-    return _ImageNumbers(offsets, rates, lcm(*steps) / min(steps), (*notes, note))
+    return _Clocks(
+        clocks.offsets + offsets * clocks.rates,
+        clocks.rates * rates,
+        # The time between two timestamps, in frames of the clip with the most frames per time.
+        clocks.fps / (lcm(*steps) / min(steps)),
+    ), notes
 
 
 def _table(names: Sequence[str], numbers: Mapping[int, range], group: Sequence[int]) -> str:
@@ -221,31 +238,6 @@ def _range(numbers: Sequence[int]) -> str:
     text = f"{numbers[0]} to {numbers[-1]}"
     step = numbers[1] - numbers[0]
     return text if step == 1 else f"{text} by {step}"
-
-
-def _timestamps(
-    path: Path,
-    names: Sequence[str],
-    readers: Sequence[FrameReader],
-    config: ReadConfig,
-    exact: _Clocks,
-    max_frames: int | None,
-) -> tuple[_Clocks, np.ndarray]:
-    """Return the clocks by which frames are selected, and the timestamps [T]."""
-    if config.trim or config.offset:
-        clocks = _without_drift(exact, readers, max_frames)
-        return clocks, _common_timestamps(path, names, readers, config, clocks)[:max_frames]
-    num_frames = _num_frames(path, readers, max_frames, config.gaps)
-    # Frames with the same index must be simultaneous.
-    drift = np.ptp(exact.rates) * (num_frames - 1)
-    if drift > _NEAR:
-        rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
-        raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {rates}, up to {drift:.1f} "
-            "frames apart; use the lowest one with --trim, or set `fps` in capture.json."
-        )
-    timestamps = np.arange(num_frames, dtype=float)
-    return replace(exact, rates=np.ones(len(readers))), timestamps
 
 
 def _clip_times(
@@ -273,26 +265,6 @@ def _image_positions(reader: FrameReader, clip: ClipTimes, positions: np.ndarray
     return clip.frame_indices - clip.delay
 
 
-def _warn_apart(
-    path: Path,
-    readers: Sequence[FrameReader],
-    clips: Sequence[ClipTimes],
-    positions: np.ndarray,
-    clocks: _Clocks,
-) -> None:
-    """Warn if images of one timestamp are apart, by the clips' clocks; the timestamps are at
-    `positions` [C, T].
-    """
-    places = np.array(list(map(_image_positions, readers, clips, positions)))
-    times = (places - clocks.offsets[:, None]) / clocks.rates[:, None]
-    has_frame = np.stack([clip.frame_indices >= 0 for clip in clips])
-    latest = np.where(has_frame, times, -np.inf).max(axis=0)
-    earliest = np.where(has_frame, times, np.inf).min(axis=0)
-    spread = float(np.max(latest - earliest, initial=0)) / clocks.fps
-    if spread > 1e-3:
-        _LOG.warning("%s: images of one timestamp are up to %.1f ms apart.", path, 1e3 * spread)
-
-
 @dataclass(frozen=True)
 class _Clocks:
     """Offset o and rate r of every clip [C], and the number of timestamps per second (see the
@@ -309,11 +281,8 @@ def _clocks(
     readers: Sequence[FrameReader],
     config: ReadConfig,
     fps: float | None,
-    numbers: _ImageNumbers,
 ) -> _Clocks:
-    """Return the clocks of the clips by their offsets, their frame rates and the numbers of their
-    images.
-    """
+    """Return the clocks of the clips by their offsets and their frame rates."""
     clip_fps = [fps or reader.fps for reader in readers]
     lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
     rates = np.array([(rate or lowest) / lowest for rate in clip_fps])
@@ -324,8 +293,7 @@ def _clocks(
             index = round(config.offset.get(names[c], 0))
             nearest = min(max(index, 0), len(reader.positions) - 1)
             offsets[c] = round(reader.positions[nearest]) + index - nearest
-    fps = lowest / numbers.interval
-    return _Clocks(offsets + numbers.offsets * rates, rates * numbers.rates, fps)
+    return _Clocks(offsets, rates, lowest)
 
 
 def _without_drift(
@@ -363,11 +331,12 @@ def _common_timestamps(
     first = np.ceil(np.max(-clocks.offsets / clocks.rates))
     last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
     if last < first:
-        per_second = clocks.rates * clocks.fps
-        starts = (0 - clocks.offsets) / per_second
-        stops = (lengths - clocks.offsets) / per_second
-        spans = zip(names, starts, stops, strict=True)
-        table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
+        spans = np.stack([0 * lengths, lengths], axis=1) - clocks.offsets[:, None]
+        spans = spans / (clocks.rates * clocks.fps)[:, None]
+        table = ", ".join(
+            f"{name} {start:.2f} to {stop:.2f} s"
+            for name, (start, stop) in zip(names, spans, strict=True)
+        )
         raise ValueError(f"{path}: the clips have no timestamp in common, {table}; check `offset`.")
     return np.arange(first, last + 1)
 
@@ -417,16 +386,17 @@ def _num_frames(
 ) -> int:
     """Return the number of timestamps of clips that are not aligned."""
     if gaps:
-        longest = max(_periods(reader) for reader in readers)
+        longest = max(map(_periods, readers))
         return min(longest, max_frames or longest)
     for reader in readers:
         required = min(reader.num_frames, max_frames or reader.num_frames)
         _check_complete(reader, required)
         _check_even(reader, required)
-    shortest = min(reader.num_frames for reader in readers)
+    lengths = [reader.num_frames for reader in readers]
+    shortest = min(lengths)
     if max_frames is not None and max_frames <= shortest:
         return max_frames
-    if any(reader.num_frames > shortest for reader in readers):
+    if max(lengths) > shortest:
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "

@@ -15,8 +15,9 @@ from morgs_mi.capture.features import (
     reprojection_errors,
     triangulate,
 )
-from morgs_mi.capture.points import SharedFeatures
+from morgs_mi.capture.points import SharedFeatures, triangulate_points
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import seen_points
 from tests.assertions import assert_close
 from tests.scenes import textured
 from tests.scenes.cameras import look_at_cameras
@@ -78,7 +79,7 @@ def test_triangulate__finds_points_on_the_planes(
     textured_capture: Capture, textured_features: SharedFeatures
 ) -> None:
     points, colors = triangulate(
-        textured_features.matches, textured_features.features, textured_capture.cameras
+        textured_features.matches, textured_features.features, textured_capture.cameras, 2.0
     )
     assert points.dtype == colors.dtype == np.float32
     assert len(points) > 1000
@@ -88,26 +89,17 @@ def test_triangulate__finds_points_on_the_planes(
     assert np.percentile(distance, 90) < 0.05
     assert np.percentile(distance, 98) < 0.3
     # Their colours are the colours of the pixels onto which they project.
-    camera = textured_capture.cameras[2]
     image = next(textured_capture.frames()).images[2]
-    pixels, depths = camera.project(points)
+    mask, pixels, _ = seen_points(textured_capture.cameras[2], points)
     u, v = pixels.astype(int).T
-    mask = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > 0)
-    assert np.median(np.abs(image[v[mask], u[mask]] / 255 - colors[mask])) < 0.05
+    assert np.median(np.abs(image[v, u] / 255 - colors[mask])) < 0.05
 
 
 def test_triangulate__leaves_out_points_with_a_small_angle(
-    textured_capture: Capture, textured_features: SharedFeatures
+    textured_capture: Capture, textured_features: SharedFeatures, monkeypatch
 ) -> None:
-    counts = [
-        len(
-            triangulate(
-                textured_features.matches,
-                textured_features.features,
-                textured_capture.cameras,
-                min_angle=angle,
-            )[0]
-        )
-        for angle in (1, 20, 60)
-    ]
+    counts = []
+    for angle in (1, 20, 60):
+        monkeypatch.setattr("morgs_mi.capture.features.MIN_ANGLE", angle)
+        counts.append(len(triangulate_points(textured_capture, textured_features).points))
     assert counts[0] > counts[1] > counts[2] == 0

@@ -15,9 +15,9 @@ from morgs_mi.capture.layouts.clips import (
     EXAMPLE,
     check_frames,
     clip_of_camera,
-    clips_by_camera,
     clips_by_frame,
     clips_by_rig,
+    find_clips,
     names_without,
     photos,
     photos_by_rig,
@@ -164,7 +164,7 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
     Raises:
         FileNotFoundError: the capture folder has none.
     """
-    if clips := clips_by_camera(path) or photos(path) or clips_by_rig(path):
+    if clips := find_clips(path):
         return clips
     raise FileNotFoundError(
         f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; "
@@ -199,8 +199,40 @@ def match_clips(
     """
     # Tolerances of poses are relative to their coordinates.
     local = moved(cameras, far_origin(cameras))
-    match = _best_match(path, source, clips, local, lenses)
+    parts = [PurePosixPath(camera.name.replace("\\", "/")).parts[:-1] for camera in cameras]
+    folders = map(clips.get, {folder for place in parts for folder in place})
+    in_folders = any(isinstance(clip, Path) and clip.is_dir() for clip in folders)
+    attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
+        (lambda _: clips, True),
+        (lambda _: {} if in_folders else clips, False),
+        (photos, False),
+        (clips_by_frame, False),
+        (clips_by_rig, True),
+        (photos_by_rig, False),
+    )
+    matches = []
+    errors = []
+    for find, by_folder in attempts:
+        try:
+            matches.append(_matched(source, find(path), local, lenses, by_folder))
+        except ValueError as error:
+            errors.append(error)
+            continue
+        if not matches[-1].without:
+            break
+    # The match with the most cameras.
+    match = max(matches, key=lambda match: len(match.images), default=_NamedMatch({}, {}, []))
+    if not match.images:
+        if errors:
+            raise errors[0]
+        raise FileNotFoundError(
+            f"{source}: expected clips named after its cameras "
+            f"{few([camera.name for camera in cameras])}, found {', '.join(clips)}; name the clips "
+            "after the cameras."
+        )
     clips = match.clips
+    if any(isinstance(clip, tuple) and len(clip) > 1 for clip in clips.values()):
+        check_frames(path, cast(Mapping[str, tuple[Path, ...]], clips))
     if match.without:
         _LOG.warning("%s: no clip is named after %s: left out.", source, few(match.without))
     if extras := [name for name in clips if name not in match.images]:
@@ -249,51 +281,6 @@ class _NamedMatch:
     # Indices of the cameras of each clip that has some, by the clip's name.
     images: dict[str, list[int]]
     without: list[str]  # names of the cameras that have no clip
-
-
-def _best_match(
-    path: Path,
-    source: Path,
-    clips: Mapping[str, Clip],
-    cameras: Sequence[Camera],
-    lenses: Sequence[Lens],
-) -> _NamedMatch:
-    """Return the match of `clips`, photos or frame folders with the most cameras; see
-    `match_clips`.
-    """
-    parts = [PurePosixPath(camera.name.replace("\\", "/")).parts[:-1] for camera in cameras]
-    folders = map(clips.get, {folder for place in parts for folder in place})
-    in_folders = any(isinstance(clip, Path) and clip.is_dir() for clip in folders)
-    matches = []
-    errors = []
-    attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
-        (lambda _: clips, True),
-        (lambda _: {} if in_folders else clips, False),
-        (photos, False),
-        (clips_by_frame, False),
-        (clips_by_rig, True),
-        (photos_by_rig, False),
-    )
-    for find, by_folder in attempts:
-        try:
-            matches.append(_matched(source, find(path), cameras, lenses, by_folder))
-        except ValueError as error:
-            errors.append(error)
-            continue
-        if not matches[-1].without:
-            break
-    best = max(matches, key=lambda match: len(match.images), default=None)
-    if best is None or not best.images:
-        if errors:
-            raise errors[0]
-        raise FileNotFoundError(
-            f"{source}: expected clips named after its cameras "
-            f"{few([camera.name for camera in cameras])}, found {', '.join(clips)}; name the clips "
-            "after the cameras."
-        )
-    if any(isinstance(clip, tuple) and len(clip) > 1 for clip in best.clips.values()):
-        check_frames(path, cast(Mapping[str, tuple[Path, ...]], best.clips))
-    return best
 
 
 def _matched(

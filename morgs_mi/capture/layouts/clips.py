@@ -50,6 +50,13 @@ _NOT_CAMERAS = re.compile(rf"{'|'.join(_NOT_CLIPS)}|frames|images|{_COPIES.patte
 _USUAL = {"images", "videos"}
 
 
+def find_clips(path: Path) -> Mapping[str, Clip]:
+    """Return each camera's video, folder of images or photo by the camera's name, in numerical
+    order; errors of `clips_by_camera`.
+    """
+    return clips_by_camera(path) or photos(path) or clips_by_rig(path)
+
+
 def clips_by_camera(path: Path) -> dict[str, Path]:
     """Return each camera's video or folder of images by the camera's name, in numerical order.
 
@@ -205,50 +212,34 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     return matches.pop() if len(matches) == 1 else None
 
 
-class ImageSizes:
-    """Sizes of the images that a calibration names, from their files or their clips.
+def image_size(folder: Path, image: str, clips: Mapping[str, Clip]) -> tuple[int, int] | None:
+    """Return the width and height of an image, None if it has neither a file nor a clip.
 
     Args:
-        folder: the folder of the calibration, from which the images are named, with or without
-            their suffixes.
+        folder: the folder of the calibration, from which the image is named.
+        image: its name.
         clips: clips by name, for images that are no files.
+
+    Raises:
+        ValueError: the file or the clip cannot be read.
     """
-
-    def __init__(self, folder: Path, clips: Mapping[str, Clip]) -> None:
-        self._folder = folder
-        self._clips = clips
-        self._files: dict[Path, dict[str, Path]] = {}
-        self._sizes: dict[Clip, tuple[int, int]] = {}
-
-    def of(self, image: str) -> tuple[int, int] | None:
-        """Return the width and height of an image, None if it has neither a file nor a clip.
-
-        Raises:
-            ValueError: the file or the clip cannot be read.
-        """
-        clip: Clip | None = self._folder / image.replace("\\", "/")
-        if not clip.is_file():
-            folder = clip.parent
-            if folder not in self._files:
-                images = images_in(folder) if folder.is_dir() else ()
-                self._files[folder] = {file.stem: file for file in images}
-            clip = self._files[folder].get(clip.name)
-        if clip is None:
-            name = view_of_image(self._clips, image, by_folder=True)
-            if name is None:
-                return None
-            clip = self._clips[name]
-        if clip not in self._sizes:
-            frames = clip
-            size = (-1, -1)
-            if isinstance(clip, Path) and clip.is_file():
-                size = imagesize.get(clip)
-                frames = clip if clip.suffix.lower() in VIDEO_SUFFIXES else (clip,)
-            if min(size) < 1:  # no header of an image, or one that does not show it
-                reader = open_frames(frames)
-                size = (reader.width, reader.height)
-            self._sizes[clip] = size
-        return self._sizes[clip]
+    clip: Clip = folder / image.replace("\\", "/")
+    if not clip.is_file() and clip.parent.is_dir():  # a name without the suffix
+        files = {file.stem: file for file in images_in(clip.parent)}
+        clip = files.get(clip.name, clip)
+    if clip.is_file():
+        size = imagesize.get(clip)
+        if min(size) > 0:
+            return size
+        # No header of an image, or one that does not show its size.
+        if clip.suffix.lower() not in VIDEO_SUFFIXES:
+            clip = (clip,)
+    elif name := view_of_image(clips, image, by_folder=True):
+        clip = clips[name]
+    else:
+        return None
+    reader = open_frames(clip)
+    return reader.width, reader.height
 
 
 def _folders(folder: Path) -> dict[str, Path]:

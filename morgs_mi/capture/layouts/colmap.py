@@ -36,7 +36,7 @@ from morgs_mi.capture.layouts.colmap_files import (
     text_points,
 )
 from morgs_mi.capture.layouts.nerfstudio import read_points_ply
-from morgs_mi.capture.lens import Lens, lens_and_intrinsics
+from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import errors_at, few
@@ -103,21 +103,23 @@ def read_colmap(folder: str | Path) -> ColmapModel:
             unsupported lens. Points are not checked.
     """
     folder = Path(folder)
-    kind = "bin" if (folder / "cameras.bin").exists() else "txt"
-    cameras_path, images_path = (folder / f"{name}.{kind}" for name in _FILES)
-    for path in (cameras_path, images_path):
-        existing_file(path, "a file of a COLMAP model", "export the whole model")
-    is_binary = kind == "bin"
+    is_binary = (folder / "cameras.bin").exists()
+    kind = "bin" if is_binary else "txt"
+    cameras_path, images_path = (
+        existing_file(
+            folder / f"{name}.{kind}", "a file of a COLMAP model", "export the whole model"
+        )
+        for name in _FILES
+    )
     intrinsics = {}
-    for camera_id, model, *size, params in (binary_cameras if is_binary else text_cameras)(
-        cameras_path
-    ):
+    rows = binary_cameras(cameras_path) if is_binary else text_cameras(cameras_path)
+    for camera_id, model, *size, params in rows:
         with errors_at(f"{cameras_path}: camera {camera_id}"):
             intrinsics[camera_id] = (*lens_and_intrinsics(model, params), *size)
         check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
     cameras: list[Camera] = []
     lenses: list[Lens] = []
-    rows = (binary_images if is_binary else text_images)(images_path)
+    rows = binary_images(images_path) if is_binary else text_images(images_path)
     for name, camera_id, pose in rows:
         with errors_at(f"{images_path}, image {name!r}"):
             if camera_id not in intrinsics:
@@ -142,7 +144,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     elif path.suffix == ".ply":
         points, colors = read_points_ply(path)
     else:
-        rows = (binary_points if path.suffix == ".bin" else text_points)(path)
+        rows = binary_points(path) if path.suffix == ".bin" else text_points(path)
         table = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
         points, colors = np.hsplit(table, 2)
         colors = (colors / 255).astype(np.float32)
@@ -182,8 +184,7 @@ def write_colmap(
         name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
         image_lines.append(_line(i, w, x, y, z, *viewmat[:3, 3].tolist(), i, name))
         image_lines.append("\n")  # no points
-        one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-        focals = np.diag(camera.K)[: 1 if one_focal else 2].tolist()
+        focals = np.diag(camera.K)[: MODELS[lens.model][0]].tolist()
         params = (*focals, *camera.K[:2, 2].tolist(), *lens.distortion)
         camera_lines.append(_line(i, lens.model, camera.width, camera.height, *params))
     point_lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]\n"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -26,7 +26,7 @@ from morgs_mi.capture.layouts.calibration import (
     match_clips,
     required_clips,
 )
-from morgs_mi.capture.layouts.clips import ImageSizes
+from morgs_mi.capture.layouts.clips import image_size
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, rigid
@@ -34,7 +34,6 @@ from morgs_mi.core.checks import LARGEST, errors_at
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, existing_file
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread
-from morgs_mi.io.video import Clip
 
 _LOG = logging.getLogger(__name__)
 
@@ -108,61 +107,6 @@ _KINDS: dict[str, _Kind] = {
     "ply_file_path": _FILE,
     **dict.fromkeys(_SPLITS, _NAMES),
 }
-
-
-@dataclass(frozen=True)
-class Transforms:
-    """Content of a `transforms.json`."""
-
-    cameras: list[Camera]  #: One per frame, named by its `file_path`.
-    lenses: list[Lens]  #: One per frame.
-    masks: list[Path | None]  #: Per frame the image whose black pixels are not used, or None.
-    points: Path | None  #: The points' PLY file, or None.
-    #: Names of images by split; empty if the file does not split them.
-    splits: Mapping[str, list[str]]
-
-
-def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Transforms:
-    """Return the content of a `transforms.json`.
-
-    Args:
-        path: the file.
-        clips: clips by name, whose sizes frames without `w` and `h` have if their images are no
-            files.
-
-    Raises:
-        ValueError: the file is broken, a key is missing or not a number, a pose is not rigid, or
-            the camera model is not supported.
-    """
-    meta = read_json(path)
-    meta = meta if isinstance(meta, dict) else {}
-    with errors_at(str(path)):
-        frames = _value(meta, "frames")
-        points = _value(meta, "ply_file_path")
-        splits = {split: _value(meta, split) for split in _SPLITS}
-    sizes = ImageSizes(path.parent, clips or {})
-    cameras = []
-    lenses = []
-    masks = []
-    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
-    for index, frame in enumerate(frames):
-        values = meta | frame
-        with errors_at(f"{path}, frame {index}"):
-            name = _value(values, "file_path")
-        if not {"w", "h"} <= values.keys():
-            # Of another image if it is missing: its camera is left out later.
-            names = [name, *(str(other.get("file_path")) for other in frames)]
-            size = next(filter(None, map(sizes.of, names)), ())
-            values |= zip(("w", "h"), size, strict=False)
-        with errors_at(f"{path}, frame {index} ({name})"):
-            cameras.append(_camera(values, name))
-            lenses.append(_lens(values))
-            masks.append(_beside(path, _value(values, "mask_path")))
-        if lenses[-1].model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
-            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
-    warn_unread(path, unread)
-    splits = {split: names for split, names in splits.items() if names is not None}
-    return Transforms(cameras, lenses, masks, _beside(path, points), splits)
 
 
 def _beside(path: Path, name: str | None) -> Path | None:
@@ -249,41 +193,51 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
     source = path / "transforms.json"
-    content = read_transforms(source, clips)
-    points, colors = read_points_ply(content.points) if content.points else (NO_POINTS, NO_POINTS)
-    calibration, images = match_clips(path, source, clips, content.cameras, content.lenses)
-    masks = tuple(
-        tuple(dict.fromkeys(file for index in indices if (file := content.masks[index])))
+    meta = read_json(source)
+    meta = meta if isinstance(meta, dict) else {}
+    with errors_at(str(source)):
+        frames = _value(meta, "frames")
+        points_file = _beside(source, _value(meta, "ply_file_path"))
+        splits = {split: names for split in _SPLITS if (names := _value(meta, split)) is not None}
+    cameras = []
+    lenses = []
+    masks = []
+    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
+    for index, frame in enumerate(frames):
+        values = meta | frame
+        with errors_at(f"{source}, frame {index}"):
+            name = _value(values, "file_path")
+        if not {"w", "h"} <= values.keys():
+            # Of another image if it is missing: its camera is left out later.
+            names = [name, *(str(other.get("file_path")) for other in frames)]
+            sizes = (image_size(path, each, clips) for each in names)
+            values |= zip(("w", "h"), next(filter(None, sizes), ()), strict=False)
+        with errors_at(f"{source}, frame {index} ({name})"):
+            cameras.append(_camera(values, name))
+            lenses.append(_lens(values))
+            masks.append(_beside(source, _value(values, "mask_path")))
+        if lenses[-1].model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
+            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
+    warn_unread(source, unread)
+    points, colors = read_points_ply(points_file) if points_file else (NO_POINTS, NO_POINTS)
+    calibration, images = match_clips(path, source, clips, cameras, lenses)
+    clip_masks = tuple(
+        tuple(dict.fromkeys(file for index in indices if (file := masks[index])))
         for indices in images
     )
-    masks = masks if any(masks) else calibration.masks
-    calibration = replace(calibration, points=points, point_colors=colors, masks=masks)
-    return _split(path, source, calibration, content, images) if content.splits else calibration
-
-
-def _split(
-    path: Path,
-    source: Path,
-    calibration: Calibration,
-    content: Transforms,
-    images: Sequence[Sequence[int]],
-) -> Calibration:
-    """Return the calibration with the held-out cameras of `content`, and without those that are in
-    no split.
-
-    A camera is trained on if one of its images is: is in `train_filenames` or, without these, in no
-    other split.
-
-    Raises:
-        ValueError: no camera is left for training.
-    """
-    names = [camera.name for camera in content.cameras]
-    splits = {
-        split: _images_named(source, split, split_names, names)
-        for split, split_names in content.splits.items()
-    }
-    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
-    training = splits.get("train_filenames", set(range(len(names))) - held_out)
+    calibration = replace(
+        calibration,
+        points=points,
+        point_colors=colors,
+        masks=clip_masks if any(clip_masks) else calibration.masks,
+    )
+    if not splits:
+        return calibration
+    # A camera is trained on if one of its images is: is in `train_filenames` or, without these, in
+    # no other split.
+    indices = _images_named(source, splits, [camera.name for camera in cameras])
+    held_out = indices.get("val_filenames", set()) | indices.get("test_filenames", set())
+    training = indices.get("train_filenames", set(range(len(cameras))) - held_out)
     views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
     if len(views) == len(images):
         raise ValueError(
@@ -297,27 +251,30 @@ def _split(
 
 
 def _images_named(
-    source: Path, split: str, split_names: Sequence[str], names: Sequence[str]
-) -> set[int]:
-    """Return the indices of the images `names` that a split names, in full or by the end of one
-    path alone.
+    source: Path, splits: Mapping[str, Sequence[str]], names: Sequence[str]
+) -> dict[str, set[int]]:
+    """Return the indices of the images `names` in each split, which names them in full or by the
+    end of one path alone.
     """
-    whole: dict[tuple[str, ...], set[int]] = {}
-    ends: dict[tuple[str, ...], set[int]] = {}
-    for index, parts in enumerate(map(_parts, names)):
-        whole.setdefault(parts, set()).add(index)
-        for start in range(1, len(parts)):
-            ends.setdefault(parts[start:], set()).add(index)
-    indices = {end: same for end, same in ends.items() if len(same) == 1} | whole
-    if unknown := [name for name in split_names if _parts(name) not in indices]:
-        _LOG.warning(
-            "%s: `%s` names %d images without a frame, such as %s.",
-            source,
-            split,
-            len(unknown),
-            unknown[0],
-        )
-    return set().union(*(indices.get(_parts(name), set()) for name in split_names))
+    places = list(map(_parts, names))
+    images: dict[str, set[int]] = {}
+    for split, split_names in splits.items():
+        images[split] = set()
+        unknown = []
+        for name in split_names:
+            parts = _parts(name)
+            ends = {i for i, place in enumerate(places) if place[-len(parts) :] == parts}
+            whole = {i for i in ends if places[i] == parts}
+            if not whole and len(ends) != 1:
+                unknown.append(name)
+            else:
+                images[split] |= whole or ends
+        if unknown:
+            _LOG.warning(
+                "%s: `%s` names %d images without a frame, such as %s.",
+                *(source, split, len(unknown), unknown[0]),
+            )
+    return images
 
 
 def _parts(name: str) -> tuple[str, ...]:

@@ -68,16 +68,15 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
     """
     rows = []
     for camera, near_far in zip(cameras, bounds, strict=True):
-        K = camera.K
-        middle = np.array([camera.width, camera.height]) / 2
-        one_focal = np.allclose(K[0, 0], K[1, 1], rtol=1e-6)
-        if not one_focal or not np.allclose(K[:2, 2], middle, atol=1e-3):
+        f = camera.K[0, 0]
+        K = [[f, 0, 0.5 * camera.width], [0, f, 0.5 * camera.height], [0, 0, 1]]
+        if not np.allclose(camera.K, K, rtol=1e-6, atol=1e-3):
             raise ValueError(
                 f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
-                f"centred principal point, got K={K.tolist()}; use write_colmap()."
+                f"centred principal point, got K={camera.K.tolist()}; use write_colmap()."
             )
         right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
-        hwf = [camera.height, camera.width, K[0, 0]]
+        hwf = [camera.height, camera.width, f]
         pose = np.stack([down, right, -forward, camera.position, hwf], axis=1)
         rows.append([*pose.ravel(), *near_far])
     # np.save() into a file does not report that the disk has no room for the last few kB.

@@ -54,8 +54,3 @@ def find_reader(path: Path) -> Reader:
         f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run "
         f"`morgs-mi calibrate` on the folder.{recording if static else ''}"
     )
-
-
-def reader_called(name: str) -> Reader | None:
-    """Return the reader of the layout with this name, or None."""
-    return next((reader for reader in READERS if reader.name == name), None)

@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from morgs_mi.capture.features import Tracks, intersect
@@ -183,7 +184,7 @@ def undistorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> n
 
 
 def camera_jacobian(
-    camera: Camera, factor: float, points: np.ndarray, distortion: np.ndarray | None = None
+    camera: Camera, factor: float, points: np.ndarray, distortion: ArrayLike = (0, 0)
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of pixel positions by the changes of the camera [n, 2, 11] and by the
     points [n, 2, 3].
@@ -195,7 +196,7 @@ def camera_jacobian(
         camera: camera with the changes so far.
         factor: 1 + s.
         points: [n, 3], world units; the derivatives of points behind the near plane are zero.
-        distortion: k [2] so far, of images that are not undistorted by it; default: none.
+        distortion: k [2] so far, of images that are not undistorted by it.
     """
     R = np.asarray(camera.viewmat, np.float64)[:3, :3]
     x = (points - camera.position) @ R.T
@@ -203,7 +204,7 @@ def camera_jacobian(
     of_changes = np.zeros((len(x), 2, CHANGES))
     of_points = np.zeros((len(x), 2, 3))
     if front.any():
-        terms = np.append(np.zeros(2) if distortion is None else distortion, (0.0, 0.0))
+        terms = np.append(distortion, (0.0, 0.0))
         # By a rotation and a displacement of the points, f, c and k.
         pose = np.zeros(3)
         J = cv2.projectPoints(x[front], pose, pose, camera.K, terms)[1].reshape(-1, 2, 14)
@@ -271,7 +272,8 @@ class NormalEquations:
         # Derivatives of the points by a rotation about their mean, a displacement and a factor.
         from_centre = points - points.mean(axis=0)
         shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-        similarity = np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
+        turns = -np.cross(np.eye(3), from_centre[:, None])
+        similarity = np.concatenate([turns, shifts, from_centre[..., None]], axis=2)
         rows[:7] = np.einsum("pij,pvki->jvk", similarity, self._coupling)
         rows[7, :, 6] = 1
         return rows.reshape(8, -1)
@@ -281,7 +283,7 @@ class NormalEquations:
         changes: np.ndarray,
         deviations: np.ndarray,
         damping: float,
-        frame: np.ndarray | None = None,
+        frame: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the step of Levenberg and Marquardt for cameras [V, 11] and points [P, 3], by
         Schur's complement.
@@ -290,7 +292,7 @@ class NormalEquations:
             changes: changes of the cameras so far [V, 11].
             deviations: standard deviations of the priors of a camera's changes [11].
             damping: relative increase of the diagonal.
-            frame: constraints on the changes after the step, as from `frame`; None: no constraints.
+            frame: constraints on the changes after the step [n, V 11], as from `frame`.
         """
         precision = deviations**-2.0
         cameras = _damped(self._cameras + np.diag(precision), damping)
@@ -301,7 +303,6 @@ class NormalEquations:
         by_points = np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
         matrix = np.asarray(block_diag(*cameras)) - by_points
         right = right - np.einsum("pij,pj->i", solved, self._right_points)
-        frame = np.zeros((0, right.size)) if frame is None else frame
         step = _solved(matrix, -right, frame, -frame @ changes.ravel())
         rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
         return step.reshape(changes.shape), np.linalg.solve(points, rest[..., None])[..., 0]
@@ -317,11 +318,6 @@ def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -
     value = value / lengths
     system = np.block([[A, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
     return np.linalg.solve(system, np.concatenate([b, value]))[: len(b)]
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices [n, 3, 3] of the cross products by vectors [n, 3] from the left."""
-    return np.cross(np.eye(3), vectors[:, None])
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
+from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +29,7 @@ from annotated_types import Ge, Lt
 from morgs_mi.capture.layouts.clips import (
     EXAMPLE,
     clips_by_camera,
-    clips_by_rig,
+    find_clips,
     names_without,
     photos,
 )
@@ -41,7 +42,7 @@ from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.progress import Report
-from morgs_mi.io.video import open_clips
+from morgs_mi.io.video import Clip, open_clips
 from morgs_mi.studio.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
 
@@ -216,7 +217,7 @@ def calibrate(
         # Images of a folder of photos are named after their files, which other programs open by
         # these names.
         files = {} if clips_by_camera(path) else photos(path)
-        for image in map(best.model.image, best.model.reg_image_ids()):
+        for image in _registered(best.model):
             if (name := Path(image.name).stem) in files:
                 image.name = files[name][0].name
         with atomic_path(path / "sparse", "calibrate()") as folder:
@@ -226,22 +227,25 @@ def calibrate(
 
 def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     """Return the result of each camera from its points in COLMAP's model."""
-    images = {Path(model.image(i).name).stem: model.image(i) for i in model.reg_image_ids()}
+    images = {Path(image.name).stem: image for image in _registered(model)}
     checks = {name: _check(name, images.get(name), model) for name in names}
-    poses = [
-        np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images.values()
-    ]
-    cameras = [Camera(np.eye(3), pose, 1, 1) for pose in poses]  # with any intrinsics
-    posed_names = [*images]
-    for i, j in duplicate_poses(cameras):
-        for view, other in ((i, j), (j, i)):
-            name = posed_names[view]
+    cameras = []  # with any intrinsics
+    for name, image in images.items():
+        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        cameras.append(Camera(np.eye(3), pose, 1, 1, name))
+    for pair in duplicate_poses(cameras):
+        for name, other in permutations(cameras[view].name for view in pair):
             advice = (
-                f"it has the same pose as {posed_names[other]}: one clip seems to be a copy of the "
-                "other; replace it"
+                f"it has the same pose as {other}: one clip seems to be a copy of the other; "
+                "replace it"
             )
             checks[name] = replace(checks[name], fits=False, advice=advice)
     return tuple(checks.values())
+
+
+def _registered(model: Any) -> list[Any]:
+    """Return the images of a model."""
+    return [model.image(i) for i in model.reg_image_ids()]
 
 
 def _write_model(model: Any, folder: Path) -> None:
@@ -302,12 +306,10 @@ def _frames(
         name: reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
         for name, reader in readers.items()
     }
-    short = [name for name, last in last_frames.items() if not 0 <= config.frame <= last]
-    if short:
-        names = ", ".join(short)
+    if short := [name for name, last in last_frames.items() if not 0 <= config.frame <= last]:
         raise ValueError(
-            f"{path}: frame {config.frame} is not in the clips of {names}; choose another "
-            "one (--frame)."
+            f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose "
+            "another one (--frame)."
         )
     frames = {}
     for name, reader in readers.items():
@@ -319,20 +321,19 @@ def _frames(
     return images, {name: mask for name, mask in masks.items() if mask is not None}
 
 
-def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
+def _clips(path: Path, without: Sequence[str]) -> dict[str, Clip]:
     """Return the files of at least two cameras by name, except of those to leave out."""
-    clips = clips_by_camera(path) or photos(path) or clips_by_rig(path)
-    clips = {name: clips[name] for name in names_without(path, clips, without)}
+    clips = find_clips(path)
+    names = names_without(path, clips, without)
     requirement = "expected names without line feeds, as COLMAP has one image a line"
-    broken = [name for name in clips if "\n" in name]
+    broken = [name for name in names if "\n" in name]
     require(not broken, str(path), requirement, repr(few(broken)), "rename it")
-    if len(clips) < 2:
-        names = ", ".join(clips) or "none"
+    if len(names) < 2:
         raise ValueError(
-            f"{path}: expected the clips of at least two cameras, found {names}; check the path, "
-            f"or make {EXAMPLE}"
+            f"{path}: expected the clips of at least two cameras, found "
+            f"{', '.join(names) or 'none'}; check the path, or make {EXAMPLE}"
         )
-    return clips
+    return {name: clips[name] for name in names}
 
 
 def match_views(
@@ -475,19 +476,18 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     pycolmap = import_pycolmap()
 
     model = pycolmap.Reconstruction()  # a copy in which no two images share a camera
-    for i in candidate.model.reg_image_ids():
-        image = candidate.model.image(i)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in _registered(candidate.model):
+        i = image.image_id
         camera = pycolmap.Camera(candidate.model.camera(image.camera_id).todict())
         camera.camera_id = i
         model.add_camera_with_trivial_rig(camera)
         keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
         model.add_image_with_trivial_frame(image_copy, image.cam_from_world())
+        config.add_image(i)
     for point in candidate.model.points3D.values():
         model.add_point3D(point.xyz, point.track, point.color)
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in model.reg_image_ids():
-        config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False,

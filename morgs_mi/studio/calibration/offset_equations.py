@@ -152,10 +152,9 @@ def offset_equations(
     inverses = np.linalg.inv(curvatures + prior[:, None, None] * np.eye(3))
     weights = np.einsum("vki,kij->vkj", c, inverses)
     parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
-    groups = parts
-    if len(means):  # Gaussians with the same nearest centre form a group
-        _, labels = KDTree(means[::_GROUP]).query(means)
-        groups = np.stack([np.bincount(labels, row) for row in parts])
+    # Gaussians with the same nearest centre form a group.
+    _, labels = KDTree(means[::_GROUP]).query(means)
+    groups = np.stack([np.bincount(labels, row) for row in parts])
     diagonal = np.einsum("vki,ki->v", c, d)
     matrix = np.diag(diagonal)
     matrix[:, train] -= np.einsum("vki,wki->vw", weights, c[train])
@@ -172,9 +171,10 @@ def blurred(image: np.ndarray, blur: float) -> np.ndarray:
 def image_gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of a float32 image [H, W, C] by x and y, per px (Sobel's filter)."""
     x, y = (
-        cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
+        np.asarray(cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8))
+        for order in ((1, 0), (0, 1))
     )
-    return np.asarray(x), np.asarray(y)
+    return x, y
 
 
 def gradient_products(

@@ -148,24 +148,22 @@ class Refinement:
         views = [view for v in capture.test_views if (view := _view(capture, frame.images, v))]
         if not views:
             return result
-        calibrated_psnr = mean_psnr(gaussians, views, config.render)
         extent = scene_extent([capture.cameras[v] for v in capture.train_views])
-        cameras = [
-            register_camera(gaussians, view, extent, config.fit, config.render) for view in views
-        ]
         registered = [
-            view._replace(camera=camera) for view, camera in zip(views, cameras, strict=True)
+            view._replace(
+                camera=register_camera(gaussians, view, extent, config.fit, config.render)
+            )
+            for view in views
         ]
-        registered_psnr = mean_psnr(gaussians, registered, config.render)
-        return result | {
-            "held_out": {"calibrated_psnr": calibrated_psnr, "registered_psnr": registered_psnr}
-        }
+        rigs = {"calibrated_psnr": views, "registered_psnr": registered}
+        scores = {name: mean_psnr(gaussians, rig, config.render) for name, rig in rigs.items()}
+        return result | {"held_out": scores}
 
 
 def _view(capture: Capture, images: Sequence[np.ndarray | None], view: int) -> View | None:
     """Return a view of a capture with its image, or None without an image."""
-    image = images[view]
-    return None if image is None else View(capture.cameras[view], image, capture.masks[view])
+    if (image := images[view]) is not None:
+        return View(capture.cameras[view], image, capture.masks[view])
 
 
 def refine_cameras(
@@ -191,9 +189,10 @@ def refine_cameras(
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
     deviations = prior_deviations(problem.extent, config.camera_priors)
     bundle_changes, tracks, deviations = _matched(capture, problem.indices, deviations)
+    has_rival = config.refine_cameras == "auto"
     # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
     # compared.
-    estimates = [0 * bundle_changes] * problem.has_rival + [bundle_changes] * bool(tracks)
+    estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
     fits = config.short_fits.rounds + len(estimates) + bool(estimates)
 
     def report(done: int) -> None:
@@ -203,12 +202,14 @@ def refine_cameras(
     estimates.append(problem.refined(bundle_changes, deviations, report))
     scores = problem.scores(estimates, report) if len(estimates) > 1 else [float("nan")]
     # The best estimate, apart from the calibrated cameras.
-    best = problem.has_rival + int(np.argmax(scores[problem.has_rival :]))
-    calibrated = scores[0] if problem.has_rival else float("nan")
+    best = has_rival + int(np.argmax(scores[has_rival:]))
+    calibrated = scores[0] if has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
-    sizes = problem.sizes(estimates[best])
-    refinement = Refinement(is_better, calibrated, scores[best], tracks, *sizes)
-    return problem.changed_capture(estimates[best]) if is_better else capture, refinement
+    changes = estimates[best]
+    refinement = Refinement(
+        is_better, calibrated, scores[best], tracks, *_sizes(problem.cameras, changes)
+    )
+    return problem.changed_capture(changes) if is_better else capture, refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,11 +245,6 @@ class _Problem:
         """The calibrated cameras at the size of the capture."""
         return [self.capture.cameras[v] for v in self.indices]
 
-    @property
-    def has_rival(self) -> bool:
-        """Whether the refined cameras are compared with the calibrated ones."""
-        return self.config.refine_cameras == "auto"
-
     def refined(
         self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]
     ) -> np.ndarray:
@@ -263,8 +259,8 @@ class _Problem:
         problem = self._begun(changes)
         for done in range(self.config.short_fits.rounds):
             report(done)
-            posed_problem = replace(problem, views=tuple(_changed(self.views, changes)))
-            gaussians = self._fitted(posed_problem, is_later=done > 0)
+            problem = replace(problem, views=tuple(_changed(self.views, changes)))
+            gaussians = self._fitted(problem, is_later=done > 0)
             blur = _BLURS[done] if done < len(_BLURS) else 0.0
             for _ in range(_STEPS):
                 gaussians, changes = _joint_step(
@@ -284,39 +280,25 @@ class _Problem:
             scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
         return scores
 
-    def sizes(self, changes: np.ndarray) -> tuple[float, float, float, float]:
-        """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel
-        by the lens.
-        """
-        shifts = []
-        for camera, change in zip(self.cameras, changes, strict=True):
-            corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * (camera.width, camera.height)
-            moved_corners = distorted(camera, corners, change[9:])
-            shifts.append(float(_largest_norm(moved_corners - corners) / camera.width))
-        return (
-            float(np.rad2deg(_largest_norm(changes[:, :3]))),
-            float(_largest_norm(changes[:, 3:6])),
-            float(np.abs(changes[:, 6]).max()),
-            max(shifts),
-        )
-
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
-        rows = np.zeros((len(self.capture.cameras), CHANGES))
-        rows[list(self.indices)] = changes
         cameras = list(self.capture.cameras)
-        for v in self.indices:
-            cameras[v] = changed_camera(cameras[v], rows[v])
-        rig = self.capture.with_cameras(cameras, rows[:, 9:].tolist())
+        distortions = np.zeros((len(cameras), 2))
+        for v, change in zip(self.indices, changes, strict=True):
+            cameras[v] = changed_camera(cameras[v], change)
+            distortions[v] = change[9:]
+        rig = self.capture.with_cameras(cameras, distortions.tolist())
         return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
         """Return the problem of a short fit with changed cameras."""
-        moved_points = _moved(self.capture.points, self.cameras, changes)
-        points = (moved_points, self.capture.point_colors)
-        rng = rng_of(self.seed, Stream.REFINED_POINTS)
+        points = _moved(self.capture.points, self.cameras, changes)
         return FirstFrameProblem.of(
-            _changed(self.views, changes), points, _short(self.config), self.render, rng
+            _changed(self.views, changes),
+            (points, self.capture.point_colors),
+            _short(self.config),
+            self.render,
+            rng_of(self.seed, Stream.REFINED_POINTS),
         )
 
     def _fitted(self, problem: FirstFrameProblem, is_later: bool = False) -> Gaussians:
@@ -330,7 +312,7 @@ def register_camera(
     view: View,
     extent: float,
     config: FitConfig,
-    render: RenderConfig | None = None,
+    render: RenderConfig,
 ) -> Camera:
     """Return the camera, near the given one, with which frozen Gaussians fit an image best.
 
@@ -341,7 +323,6 @@ def register_camera(
         config: settings with the priors of the changes.
         render: cut-offs.
     """
-    render = render or RenderConfig()
     priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
     deviations = prior_deviations(extent, priors)
     target = Target(view.image, view.mask)
@@ -360,7 +341,7 @@ def register_camera(
             of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
             equations = NormalEquations(1, 0)
             equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
-            step, _ = equations.step(changes, deviations, 0.0)
+            step, _ = equations.step(changes, deviations, 0.0, np.zeros((0, CHANGES)))
             changes = changes + step
             if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
                 break
@@ -402,26 +383,28 @@ def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
     return changed_views
 
 
-def _largest_norm(vectors: np.ndarray) -> float:
-    return np.linalg.norm(vectors, axis=1).max()
+def _sizes(cameras: Sequence[Camera], changes: np.ndarray) -> list[float]:
+    """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by
+    the lens.
+    """
+    shifts = []
+    for camera, change in zip(cameras, changes, strict=True):
+        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * (camera.width, camera.height)
+        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
+    vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
+    return [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
     """Return points [P, 3] moved to keep their projections in the views that show them, with
     changed cameras.
     """
-    hits = [seen_points(camera, points)[:2] for camera in cameras]
-    masks = np.array([mask for mask, _ in hits])
-    counts = masks.sum(axis=0)
-    if not counts.any():
-        return points
     rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
-    pixels = [
-        undistorted(camera, seen_pixels, change[9:])
-        for camera, (_, seen_pixels), change in zip(rig, hits, changes, strict=True)
-    ]
+    masks, pixels, _ = zip(*(seen_points(camera, points) for camera in cameras), strict=True)
+    pixels = map(undistorted, rig, pixels, changes[:, 9:])
+    counts = np.sum(masks, axis=0)
     views, ids = np.nonzero(masks)
-    intersections = intersect(ids, views, np.concatenate(pixels), rig, len(points))
+    intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
     is_determined = (counts >= 2) & np.isfinite(intersections).all(axis=1)
     return np.where(is_determined[:, None], intersections, points).astype(np.float32)
 

@@ -94,7 +94,6 @@ class TimeOffsets:
 def estimate_time_offsets(
     capture: Capture,
     progress: Steps | None = None,
-    seed: int = 0,
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
 
@@ -108,7 +107,6 @@ def estimate_time_offsets(
     Args:
         capture: a capture with clips of one frame rate.
         progress: called with (fits done, fits at most).
-        seed: seed of the fits.
 
     Raises:
         ValueError: the recording has one camera or fewer than four frames, an image is missing, or
@@ -117,16 +115,18 @@ def estimate_time_offsets(
     place = str(capture.path)
     cameras = len(capture.cameras)
     require(cameras > 1, place, "expected at least 2 cameras to compare clocks", 1, "record more")
-    clips = _Clips.of(capture)
+    clips = _Clips.of(capture, progress)
     largest = min(_LARGEST, (clips.num_frames - 2) // 2)
     requirement = "expected at least 4 frames to compare clocks"
     require(largest >= 1, place, requirement, clips.num_frames, "record longer")
-    last = clips.num_frames - 2 - largest
-    timestamps = np.linspace(largest, last, _TIMESTAMPS).round().astype(int)
-    rounds = _Rounds(clips, timestamps, seed, progress)
-    offsets, step, equations = _aligned(rounds, largest)
+    offsets, step, equations = _aligned(clips, largest)
     reference = capture.reference_view
-    part = _found_back(rounds, offsets - step, equations, reference)
+    # The part that the equations recover of a move of the clocks relative to the reference's.
+    moves = np.where(np.arange(cameras) % 2, _MOVED, -_MOVED)
+    moves[reference] = 0
+    change = clips.equations(offsets - step + moves, 0.0, largest).solution() - equations.solution()
+    part = (change[reference] - change) / np.where(moves != 0, moves, 1)
+    part = np.clip(part, _LEAST_FOUND, 1)
     errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
     settings = capture.reading.offset
     clocks = offsets - [camera.delay for camera in capture.cameras]
@@ -144,18 +144,18 @@ def estimate_time_offsets(
     )
 
 
-def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
+def _aligned(clips: _Clips, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
     """Return offsets [V] of at most `largest`, the last step [V], and the step's equations."""
-    train = rounds.clips.train
-    offsets = np.zeros(len(rounds.clips.cameras))
-    step = offsets
-    solution = offsets
+    offsets = step = solution = np.zeros(len(clips.cameras))
     for index, blur in enumerate(_BLUR_OF_ROUND):
-        equations = rounds.equations(offsets, blur)
+        equations = clips.equations(offsets, blur, largest)
         previous = solution
         solution = equations.solution()
-        change = solution - previous
-        share = _share(step[train], change[train]) if blur in _BLUR_OF_ROUND[:index] else 1.0
+        share = 1.0  # kappa of the module
+        last_step = step[clips.train]
+        if blur in _BLUR_OF_ROUND[:index] and last_step.any():
+            change = (solution - previous)[clips.train]
+            share = float(np.clip(-np.sum(last_step * change) / np.sum(last_step**2), *_SHARES))
         move = np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP)
         result = np.clip(offsets + move, -largest, largest)
         step = result - offsets
@@ -165,82 +165,36 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
     return offsets, step, equations
 
 
-def _share(step: np.ndarray, change: np.ndarray) -> float:
-    """Return kappa (see the module), within its bounds, from a step and the change of the solution
-    after it.
-    """
-    return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
-
-
-def _found_back(
-    rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int
-) -> np.ndarray:
-    """Return the part [V] that the equations recover of a move of the clocks relative to the clock
-    of `reference`.
-    """
-    moves = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
-    moves[reference] = 0
-    change = rounds.equations(offsets + moves, 0.0).solution() - equations.solution()
-    part = (change[reference] - change) / np.where(moves != 0, moves, 1)
-    return np.clip(part, _LEAST_FOUND, 1)
-
-
 @dataclass(eq=False)
-class _Rounds:
-    """Fits of successive rounds."""
-
-    clips: _Clips  # images to fit
-    timestamps: np.ndarray  # frames at which Gaussians are fitted
-    seed: int  # seed of all fits
-    progress: Steps | None  # called with (fits done, fits at most), or None
-    done: int = 0  # number of completed fits
-
-    def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
-        """Return the sum of the equations of all timestamps, with images interpolated by offsets
-        [V] and blurred.
-        """
-        parts = []
-        for timestamp in self.timestamps:
-            parts.append(_equations_at(self.clips, timestamp - offsets, blur, self.seed))
-            self.done += 1
-            if self.progress is not None:
-                # There are fewer fits if a round is left out.
-                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.timestamps))
-        equations = reduce(add, parts)
-        place = str(self.clips.capture.path)
-        requirement = f"expected motion in the first {self.clips.num_frames} frames"
-        require(equations.own.any(), place, requirement, "none", "record something that moves")
-        return equations
-
-
-@dataclass(frozen=True, eq=False)
 class _Clips:
-    """The first frames of a capture, reduced."""
+    """The first frames of a capture, reduced, and fits to them."""
 
     capture: Capture
+    progress: Steps | None  # called with (fits done, fits at most), or None
     cameras: tuple[Camera, ...]  # V views
     masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
     images: list[list[np.ndarray]]  # per view and frame uint8 [H, W, 3]
+    done: int = 0  # number of completed fits
 
     @classmethod
-    def of(cls, capture: Capture) -> _Clips:
+    def of(cls, capture: Capture, progress: Steps | None) -> _Clips:
         display = capture.displayed()
-        clips = []
-        for view in range(len(capture.cameras)):
-            clips.append([])
-            for image in display.images(view, 0, _FRAMES):
+        cameras = []
+        masks = []
+        images = []
+        for index, camera in enumerate(capture.cameras):
+            clip = []
+            for image in display.images(index, 0, _FRAMES):
                 if isinstance(image, Exception):
                     raise image
-                clips[-1].append(image)
-        views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
-        small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
-        # The images are whole frames: with the capture's delays they would be displaced twice.
-        cameras = tuple(camera.without_delays() for camera in small)
-        images = []
-        for clip, camera in zip(clips, cameras, strict=True):
-            size = (camera.width, camera.height)
+                clip.append(image)
+            view = View(camera, clip[0], capture.masks[index]).reduced(_WIDTH)
+            size = (view.camera.width, view.camera.height)
             images.append([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in clip])
-        return cls(capture, cameras, masks, images)
+            # The images are whole frames: with the capture's delays they would be displaced twice.
+            cameras.append(view.camera.without_delays())
+            masks.append(view.mask)
+        return cls(capture, progress, tuple(cameras), tuple(masks), images)
 
     @property
     def train(self) -> list[int]:
@@ -263,39 +217,50 @@ class _Clips:
             for clip, frame, share in zip(self.images, first, times - first, strict=True)
         ]
 
+    def equations(self, offsets: np.ndarray, blur: float, largest: int) -> OffsetEquations:
+        """Return the sum of the equations of all timestamps, with images interpolated by offsets
+        [V] of at most `largest` and blurred.
+        """
+        parts = []
+        last = self.num_frames - 2 - largest
+        for timestamp in np.linspace(largest, last, _TIMESTAMPS).round().astype(int):
+            parts.append(self._equations_at(timestamp - offsets, blur))
+            self.done += 1
+            if self.progress is not None:
+                # There are fewer fits if a round is left out.
+                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * _TIMESTAMPS)
+        equations = reduce(add, parts)
+        place = str(self.capture.path)
+        requirement = f"expected motion in the first {self.num_frames} frames"
+        require(equations.own.any(), place, requirement, "none", "record something that moves")
+        return equations
 
-def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
-    """Return the equations of a timestamp, which each view shows at its own time [V]."""
-    images = clips.at(times)
-    next_images = clips.at(times + 1)
-    pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
-    targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
-    gaussians = _fitted(clips, images, 2 if blur else 1, seed)
-    views = [ActiveView(camera) for camera in clips.cameras]
-    flow = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
-    gaussians = replace(gaussians, motion=flow.displacement)
-    train = np.isin(np.arange(len(views)), clips.train)
-    return offset_equations(gaussians, views, targets, train, blur)
+    def _equations_at(self, times: np.ndarray, blur: float) -> OffsetEquations:
+        """Return the equations of a timestamp, which each view shows at its own time [V]."""
+        images = self.at(times)
+        next_images = self.at(times + 1)
+        pairs = {v: FramePair(next_images[v], images[v], valid=self.masks[v]) for v in self.train}
+        gaussians = self._fitted(images, 2 if blur else 1)
+        views = [ActiveView(camera) for camera in self.cameras]
+        flow = lift_flow(gaussians, {v: views[v] for v in self.train}, observe_key_views(pairs))
+        gaussians = replace(gaussians, motion=flow.displacement)
+        targets = list(map(Target, images, self.masks))
+        train = np.isin(np.arange(len(views)), self.train)
+        return offset_equations(gaussians, views, targets, train, blur)
 
-
-def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
-    """Return Gaussians fitted to the images of the training views at one timestamp.
-
-    Args:
-        clips: cameras and points of the fit.
-        images: images of all views.
-        divisor: divisor of the numbers of Gaussians and steps.
-        seed: seed of the fit.
-    """
-    fit = FitConfig(
-        sh_degree=0,
-        num_gaussians=GAUSSIANS // divisor,
-        first_frame_steps=STEPS // divisor,
-        dropout=0.0,
-        density=DensityConfig(rounds=0),
-    )
-    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
-    rng = rng_of(seed, Stream.TIMING)
-    points = (clips.capture.points, clips.capture.point_colors)
-    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
-    return fit_first_frame(problem, fit, rng).gaussians
+    def _fitted(self, images: Sequence[np.ndarray], divisor: int) -> Gaussians:
+        """Return Gaussians fitted to the images [V] of the training views at one timestamp, by the
+        numbers of Gaussians and steps over `divisor`.
+        """
+        fit = FitConfig(
+            sh_degree=0,
+            num_gaussians=GAUSSIANS // divisor,
+            first_frame_steps=STEPS // divisor,
+            dropout=0.0,
+            density=DensityConfig(rounds=0),
+        )
+        views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
+        rng = rng_of(0, Stream.TIMING)
+        points = (self.capture.points, self.capture.point_colors)
+        problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
+        return fit_first_frame(problem, fit, rng).gaussians

@@ -150,7 +150,7 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
 def test_register_camera__finds_the_camera_of_an_image(scale):
     start = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
-    camera = register_camera(splats(), View(start, image), 1.0, FitConfig())
+    camera = register_camera(splats(), View(start, image), 1.0, FitConfig(), RenderConfig())
     error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
 

@@ -6,7 +6,7 @@ a candidate that explains the matches between the images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
 from typing import Any, TypeVar
@@ -16,7 +16,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts import poses_bounds
 from morgs_mi.capture.layouts.calibration import PoseConvention
-from morgs_mi.capture.layouts.reader_registry import reader_called
+from morgs_mi.capture.layouts.reader_registry import READERS
 from morgs_mi.core.camera import Camera
 
 # A camera or the cameras of a rig.
@@ -64,12 +64,9 @@ def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     positions = np.array([camera.position for camera in cameras])
     rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    return [
-        (i, j)
-        for i, j in combinations(range(len(cameras)), 2)
-        if np.linalg.norm(positions[i] - positions[j]) <= near
-        and np.abs(rotations[i] - rotations[j]).max() < _SAME
-    ]
+    same = np.linalg.norm(positions[:, None] - positions, axis=-1) <= near
+    same &= np.abs(rotations[:, None] - rotations).max(axis=(2, 3)) < _SAME
+    return [(i, j) for i, j in np.argwhere(np.triu(same, 1)).tolist()]
 
 
 def rig_candidates(
@@ -96,32 +93,25 @@ def rig_candidates(
             "right, backward",
         )
     else:
-        reader = reader_called(capture.layout)
-        poses = reader.poses if reader else PoseConvention()
+        conventions = {reader.name: reader.poses for reader in READERS}
+        poses = conventions.get(capture.layout, PoseConvention())
         yield from _other_conventions(cameras, poses) if poses else ()
     if len(cameras) <= _MAX_EXCHANGED:
         for i, j in combinations(range(len(cameras)), 2):
+            rig = [*cameras]
+            rig[i] = cameras[j]
+            rig[j] = cameras[i]
             names = f"{cameras[i].name} and {cameras[j].name}"
-            yield (
-                _reordered(cameras, {i: j, j: i}),
-                f"the clips of {names}, or their poses, seem to be swapped; exchange them",
-            )
+            yield rig, f"the clips of {names}, or their poses, seem to be swapped; exchange them"
     if 3 <= len(wrong) <= _MAX_PERMUTED:
         for order in permutations(wrong):
-            sources = dict(zip(wrong, order, strict=True))
-            names = ", ".join(
-                f"{cameras[view].name} has the pose of {cameras[k].name}"
-                for view, k in sources.items()
-            )
-            yield (
-                _reordered(cameras, sources),
-                f"the poses seem to be in another order ({names}); reorder them",
-            )
-
-
-def _reordered(cameras: Sequence[Camera], sources: Mapping[int, int]) -> list[Camera]:
-    """Return the camera of each view, or the camera of its source, if it has one."""
-    return [cameras[sources.get(view, view)] for view in range(len(cameras))]
+            rig = [*cameras]
+            sources = []
+            for view, source in zip(wrong, order, strict=True):
+                rig[view] = cameras[source]
+                sources.append(f"{cameras[view].name} has the pose of {cameras[source].name}")
+            names = ", ".join(sources)
+            yield rig, f"the poses seem to be in another order ({names}); reorder them"
 
 
 def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:

@@ -71,74 +71,52 @@ def draw_rig(
         test_views: indices of the held-out cameras, drawn in red.
     """
     right, forward, up = _directions(cameras)
-    frusta, *cloud = _around_middle(cameras, *points)
-    labels = [
-        (camera.name or str(view), _MARKED if view in test_views else _USUAL)
-        for view, camera in enumerate(cameras)
-    ]
+    positions = np.array([camera.position for camera in cameras])
+    middle = positions.mean(0)
+    radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    # The centre of each camera, and the corners of its image at a depth.
+    frusta = []
+    for camera in cameras:
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+        frusta += [camera.position, *camera.unproject(corners, np.full(4, 0.25 * radius))]
+    frusta = np.array(frusta) - middle
+    places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in points)
+    near = np.linalg.norm(places - middle, axis=1) < 8 * radius
+    places = places[near] - middle
+    core = np.percentile(places, [1, 99], axis=0) if len(places) else places
     panels = (
         ("From above", "right", "forward", [right, forward]),
         ("From the right", "forward", "up", [forward, up]),
     )
     for axes, (title, x, y, plane) in zip(figure.subplots(1, 2), panels, strict=True):
+        plane = np.transpose(plane)
         axes.set_title(title, fontsize=11, loc="left")
         axes.set(xlabel=f"{x}, world units", ylabel=f"{y}, world units")
-        _draw_projection(axes, np.stack(plane), frusta, labels, *cloud)
-
-
-def _draw_projection(
-    axes: Any,
-    plane: np.ndarray,
-    frusta: np.ndarray,
-    labels: Sequence[tuple[str, str]],
-    places: np.ndarray,
-    colors: np.ndarray,
-) -> None:
-    """Draw frusta [V, 5, 3], each with a name and a colour, and points on a plane [2, 3]."""
-    axes.scatter(*(plane @ places.T), s=1, c=np.clip(colors, 0, 1), rasterized=True)
-    for frustum, (name, color) in zip(frusta @ plane.T, labels, strict=True):
-        axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
-        axes.plot(*frustum[0], "o", color=color, markersize=4)
-        axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
-    core = np.percentile(places, [1, 99], axis=0) if len(places) else np.zeros((0, 3))
-    corners = np.concatenate([frusta.reshape(-1, 3), core]) @ plane.T
-    # The panel is a square around them with a margin.
-    half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
-    xlim, ylim = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
-    axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
-    axes.grid(color="0.9")
-    # The world's axes in the corner of the panel.
-    for name, color, direction in zip("xyz", _AXIS_COLORS, plane.T, strict=True):
-        if np.linalg.norm(direction) > 0.4:
-            axes.annotate(
-                name,
-                (0.12, 0.12),
-                xycoords="axes fraction",
-                xytext=36 * direction,
-                textcoords="offset points",
-                color=color,
-                arrowprops={"arrowstyle": "<-", "color": color},
-            )
-
-
-def _around_middle(
-    cameras: Sequence[Camera], points: np.ndarray, colors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the frusta [V, 5, 3] of the cameras, a selection of the points [n, 3] near them, both
-    relative to the middle of the cameras, and the colours [n, 3].
-    """
-    positions = np.array([camera.position for camera in cameras])
-    middle = positions.mean(0)
-    radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
-    # The centre of each camera, and the corners of its image at a depth.
-    depths = np.full(4, 0.25 * radius)
-    frusta = []
-    for camera in cameras:
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
-        frusta.append(np.vstack([camera.position, camera.unproject(corners, depths)]))
-    places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in (points, colors))
-    near = np.linalg.norm(places - middle, axis=1) < 8 * radius
-    return np.array(frusta) - middle, places[near] - middle, colors[near]
+        axes.scatter(*(places @ plane).T, s=1, c=np.clip(colors[near], 0, 1), rasterized=True)
+        for view, frustum in enumerate((frusta @ plane).reshape(-1, 5, 2)):
+            color = _MARKED if view in test_views else _USUAL
+            axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
+            axes.plot(*frustum[0], "o", color=color, markersize=4)
+            name = cameras[view].name or str(view)
+            axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
+        # The panel is a square around the frusta and most points, with a margin.
+        bounds = np.concatenate([frusta, core]) @ plane
+        half = 0.6 * max(np.ptp(bounds, axis=0).max(), 1e-12)
+        xlim, ylim = (bounds.min(0) + bounds.max(0))[:, None] / 2 + (-half, half)
+        axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
+        axes.grid(color="0.9")
+        # The world's axes in the corner of the panel.
+        for name, color, direction in zip("xyz", _AXIS_COLORS, plane, strict=True):
+            if np.linalg.norm(direction) > 0.4:
+                axes.annotate(
+                    name,
+                    (0.12, 0.12),
+                    xycoords="axes fraction",
+                    xytext=36 * direction,
+                    textcoords="offset points",
+                    color=color,
+                    arrowprops={"arrowstyle": "<-", "color": color},
+                )
 
 
 def _directions(cameras: Sequence[Camera]) -> np.ndarray:

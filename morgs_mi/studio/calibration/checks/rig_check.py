@@ -100,12 +100,11 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
                 checks[view] = replace(checks[view], fits=False, advice="")
         advice = f"the poses do not fit the images: {explanation}."
     else:
-        checks = [
-            replace(check, advice=_explain_camera(view, check, pairs.sampled(), group))
-            if check.fits is False and not check.advice
-            else check
-            for view, check in enumerate(_with_copies(checks, pairs))
-        ]
+        checks = _with_copies(checks, pairs)
+        for view, check in enumerate(checks):
+            if check.fits is False and not check.advice:
+                reason = _explain_camera(view, check, pairs.sampled(), group)
+                checks[view] = replace(check, advice=reason)
         wrong = ", ".join(c.name for c in checks if c.fits is False)
         not_checked = ", ".join(c.name for c in checks if c.fits is None)
         count = sum(c.fits is True for c in checks)
@@ -127,51 +126,45 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
 
 def pose_problems(views: Sequence[View]) -> list[str]:
     """Return a sentence if poses are known not to fit the images of views, otherwise none."""
-    # Large errors, such as another order of the cameras, show in small images.
-    cameras = [
-        replace(
-            view.camera.with_width(min(_WIDTH, view.camera.width)),
-            name=view.camera.name or f"view {index}",
-        )
-        for index, view in enumerate(views)
-    ]
-    features = tuple(
-        detect(cv2.resize(view.image, (c.width, c.height), interpolation=cv2.INTER_AREA), view.mask)
-        for view, c in zip(views, cameras, strict=True)
-    )
+    cameras = []
+    features = []
+    for index, view in enumerate(views):
+        # Large errors, such as another order of the cameras, show in small images.
+        camera = view.camera.with_width(min(_WIDTH, view.camera.width))
+        size = (camera.width, camera.height)
+        image = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+        features.append(detect(image, view.mask))
+        cameras.append(replace(camera, name=camera.name or f"view {index}"))
     none = np.zeros((0, 3))
     capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
-    check = check_rig(capture, SharedFeatures(features, tuple(match_views(features, cameras))))
+    matches = match_views(features, cameras)
+    check = check_rig(capture, SharedFeatures(tuple(features), tuple(matches)))
     return [check.advice] if check.fits is False else []
 
 
 def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
     """Return the results with the reasons for cameras with the pose or the clip of another one."""
-    pose_reasons: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     for pair in duplicate_poses(pairs.cameras):
         # If one of the two fits, the pose is its own.
         for view in [view for view in pair if not checks[view].fits] or pair:
-            pose_reasons.setdefault(
+            reasons.setdefault(
                 view,
                 f"it has the same pose as {checks[sum(pair) - view].name}: give each camera its "
                 "own, or leave the copy out (--without)",
             )
-    reasons = dict(pose_reasons)
-    shared = pairs.shared
-    for match in shared.matches:
-        a, b = (
-            shared.features[view].points[rows]
-            for view, rows in zip(match.views, match.features.T, strict=True)
-        )
-        is_copy = np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE
-        for view in match.views if is_copy else ():
-            if view in pose_reasons or not checks[view].fits:
-                other = checks[sum(match.views) - view].name
-                reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
-    return [
-        replace(c, fits=False, advice=reasons[view]) if view in reasons else c
-        for view, c in enumerate(checks)
-    ]
+    results = list(checks)
+    for view, advice in reasons.items():
+        results[view] = replace(results[view], fits=False, advice=advice)
+    for match in pairs.shared.matches:
+        a, b = match.pixels(pairs.shared.features)
+        if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
+            for view in match.views:
+                if view in reasons or not checks[view].fits:
+                    other = checks[sum(match.views) - view].name
+                    advice = f"its clip is a copy of the clip of {other}; replace one of them"
+                    results[view] = replace(results[view], fits=False, advice=advice)
+    return results
 
 
 @dataclass(frozen=True)
@@ -208,13 +201,8 @@ class _Pairs:
         return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
 
     def worst(self) -> float:
-        """Return the largest median error of a view, px; NaN without matches."""
-        medians = [
-            _median(errors)
-            for view in range(len(self.cameras))
-            if len(errors := self.of_view(view))
-        ]
-        return max(medians, default=float("nan"))
+        """Return the largest median error of a view, px; there must be matches."""
+        return float(np.nanmax([_median(self.of_view(view)) for view in range(len(self.cameras))]))
 
     def agreeing(self) -> set[int]:
         """Return the views with mostly small errors in the matches between them.
@@ -248,17 +236,17 @@ def _median(errors: np.ndarray) -> float:
 
 def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     """Return the result of a view; its advice is empty if the pose does not fit."""
-    all_errors = pairs.of_view(view)
-    group_errors = pairs.of_view(view, group)
-    error = _median(group_errors if len(group_errors) else all_errors)
-    count = len(group_errors) or len(all_errors)
+    all_errors = errors = pairs.of_view(view)
     advice = ""
-    if not count:
-        advice = f"no matches with any other camera: {_NO_OVERLAP}"
-    elif group and not len(group_errors):
+    if len(in_group := pairs.of_view(view, group)):
+        errors = in_group
+    elif group:
         advice = "matches only with cameras that do not fit: correct those first"
-    elif count < _MIN_MATCHES:
-        advice = f"only {count} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    if not len(errors):
+        advice = f"no matches with any other camera: {_NO_OVERLAP}"
+    elif not advice and len(errors) < _MIN_MATCHES:
+        advice = f"only {len(errors)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    error = _median(errors)
     fits = None if advice else error <= MAX_ERROR
     return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)
 
@@ -281,9 +269,8 @@ def _correct_rig(
         wrong = [view for view, check in enumerate(checks) if check.fits is False]
         candidates = [*rig_candidates(capture, wrong), *candidates]
     errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
-    if not min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
-        return None
-    return candidates[int(np.argmin(errors))]
+    if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
+        return candidates[int(np.argmin(errors))]
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
@@ -296,11 +283,11 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
         "its focal length seems", lambda factor: with_focal_factor(camera, factor), error_of
     )
     candidates = [*camera_candidates(camera), *factors]
-    errors = [error_of(camera) for camera, _ in candidates]
+    best, sentence = min(candidates, key=lambda candidate: error_of(candidate[0]))
     of_group = [_median(pairs.of_view(view, group)) for view in group]
     good = max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
-    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, good):
-        return candidates[int(np.argmin(errors))][1]
+    if error_of(best) <= min(check.error / _GAIN, MAX_ERROR, good):
+        return sentence
     cause = "no common mistake explains it"
     if np.isinf(check.error):
         cause = "the points in its images lie behind it, so it looks away from them"
