@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.layouts import poses_bounds
+from morgs_mi.capture.layouts import poses_bounds, reader_registry
 from morgs_mi.capture.layouts.calibration import PoseConvention
-from morgs_mi.capture.layouts.reader_registry import READERS
 from morgs_mi.core.camera import Camera
 
 # A camera or the cameras of a rig.
@@ -93,7 +92,7 @@ def rig_candidates(
             "right, backward",
         )
     else:
-        conventions = {reader.name: reader.poses for reader in READERS}
+        conventions = {reader.name: reader.poses for reader in reader_registry.READERS}
         poses = conventions.get(capture.layout, PoseConvention())
         yield from _other_conventions(cameras, poses) if poses else ()
     if len(cameras) <= _MAX_EXCHANGED:
