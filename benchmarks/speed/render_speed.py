@@ -82,7 +82,7 @@ def stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]
 
     tiles = np.random.default_rng(1).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
     mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))
-    region = Region(mask[: camera.height, : camera.width], RenderConfig())
+    region = Region.of(mask[: camera.height, : camera.width], RenderConfig())
     full = mi.TensorXf(target)
     tenth = mi.TensorXf(region.crop(target))
     return {"step": lambda: step(full), "tenth_step": lambda: step(tenth, region)}
