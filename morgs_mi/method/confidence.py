@@ -15,17 +15,14 @@ _FLOOR_WIDTH = 1352
 _NOISE = 0.2
 
 
-def motion_floor(width: int, config: MaskConfig | None = None) -> float:
+def motion_floor(width: int, config: MaskConfig) -> float:
     """Return the speed in pixels, in an image of `width` pixels, below which nothing counts as
     moving.
     """
-    config = config or MaskConfig()
     return max(config.floor * width / _FLOOR_WIDTH, _NOISE)
 
 
-def flow_threshold(
-    motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None
-) -> float:
+def flow_threshold(motion: np.ndarray, reliable: np.ndarray, config: MaskConfig) -> float:
     """Return the speed in pixels above which a pixel moves: max(floor, median + 4 MAD) of the
     speeds.
 
@@ -33,12 +30,11 @@ def flow_threshold(
 
     Args:
         motion: [H, W, 2] in pixels, of either sign.
-        reliable: [H, W] bool; None: all pixels.
-        config: settings of the threshold; None: the defaults.
+        reliable: [H, W] bool.
+        config: settings of the threshold.
     """
-    config = config or MaskConfig()
     speed = np.linalg.norm(motion, axis=-1)
-    speed = speed[reliable] if reliable is not None and reliable.any() else speed.ravel()
+    speed = speed[reliable] if reliable.any() else speed.ravel()
     median = np.median(speed)
     spread = np.median(np.abs(speed - median))
     return float(
@@ -46,27 +42,25 @@ def flow_threshold(
     )
 
 
-def flow_mask(
-    motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None
-) -> np.ndarray:
+def flow_mask(motion: np.ndarray, reliable: np.ndarray, config: MaskConfig) -> np.ndarray:
     """Return the mask of moving pixels [H, W] bool: the motion exceeds its `flow_threshold`
     (eq. 9).
 
     Args:
         motion: [H, W, 2] in pixels, of either sign.
         reliable: [H, W] bool; unreliable pixels are not in the mask.
-        config: settings of the threshold; None: the defaults.
+        config: settings of the threshold.
     """
-    moving = np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)
-    return moving if reliable is None else moving & reliable
+    speed = np.linalg.norm(motion, axis=-1)
+    return (speed > flow_threshold(motion, reliable, config)) & reliable
 
 
 def motion_mask(
     image: np.ndarray,
     motion: np.ndarray,
-    reliable: np.ndarray | None = None,
-    method: str = "grabcut",
-    config: MaskConfig | None = None,
+    reliable: np.ndarray,
+    method: str,
+    config: MaskConfig,
 ) -> np.ndarray:
     """Return the motion mask [H, W] bool: the flow mask, refined (eq. 10).
 
@@ -75,7 +69,7 @@ def motion_mask(
         motion: [H, W, 2] in pixels on frame t's grid.
         reliable: [H, W] bool, see `consistency_mask`.
         method: an entry of `MASK_REFINERS`.
-        config: settings of the flow mask and its refinement; None: the defaults.
+        config: settings of the flow mask and its refinement.
 
     Raises:
         ValueError: the method is not registered, or as the refiner.

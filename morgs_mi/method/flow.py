@@ -62,7 +62,12 @@ def observe_key_views(
         return observations
     # Eqs. 9 and 10.
     return {
-        v: replace(o, mask=motion_mask(pairs[v].image, o.motion, o.reliable, mask_method, masks))
+        v: replace(
+            o,
+            mask=motion_mask(
+                pairs[v].image, o.motion, o.reliable, mask_method, masks or MaskConfig()
+            ),
+        )
         for v, o in observations.items()
     }
 

@@ -129,7 +129,7 @@ def lift_flow(
         average[..., :2],
         np.maximum(average[..., 2] - np.sum(average[..., :2] ** 2, axis=-1), 0),
         np.stack([camera.projection_jacobian(means) for camera in cameras]),
-        np.array([[motion_floor(camera.width, masks)] for camera in cameras]),
+        np.array([[motion_floor(camera.width, masks or MaskConfig())] for camera in cameras]),
     )
     d = _solve(flows, np.ones_like(flows.weight))
     for _ in range(_ROUNDS):  # iteratively reweighted least squares

@@ -50,10 +50,6 @@ def test_dropped__passes_gradients_to_the_kept_alone():
     assert mask.any()
 
 
-def test_dropped__returns_the_same_without_probability():
-    assert dropped(GAUSSIANS, 0.0, np.random.default_rng(0)) is GAUSSIANS
-
-
 def test_adapted_to_images__sets_a_dropout_for_few_views_that_are_noisy_or_far_apart():
     rng = np.random.default_rng(0)
 

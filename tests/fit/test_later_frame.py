@@ -119,6 +119,8 @@ def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents()
     result = fit(start, images_of(truth), config)
     assert len(result.gaussians) > len(start)
     assert np.isfinite(result.losses["rigid"])
+    alone = fit(truth.select(np.array([3])), images_of(truth), config)
+    assert alone.losses.keys() == {"recon"}
 
 
 def test_initial_motion__continues_with_constant_velocity():

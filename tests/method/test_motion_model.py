@@ -31,11 +31,6 @@ def test_motion_model__is_the_one_that_the_setting_selects():
         MotionConfig(model="mesh")
 
 
-def test_sparse_product__is_that_of_dense_matrices():
-    x = tensor(5, 3)
-    assert_close(sparse_product(MATRIX, x), MATRIX.toarray() @ np.asarray(x), atol=1e-6)
-
-
 def test_sparse_product__has_an_adjoint_in_both_modes():
     x = tensor(5, 3)
     weight = tensor(9, 3)

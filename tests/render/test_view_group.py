@@ -129,12 +129,3 @@ def test_backproject__is_the_transpose_of_blending():
     assert np.vdot(sums[:, 0], confidence) == pytest.approx(
         np.vdot(blended, image), rel=tol.DUALITY_REL
     )
-
-
-def test_backproject__of_ones_sums_to_alpha():
-    raw = as_float32(make_scene())
-    camera = make_camera()
-    ones = np.ones((camera.height, camera.width, 3), np.float32)
-    sums = backproject(to_gaussians(raw), ActiveView(camera), ones)
-    alpha = np.asarray(rasterize(to_gaussians(raw), camera, ("alpha",)).alpha, np.float64)
-    assert_close(sums.sum(0), np.full(3, alpha.sum()), rtol=tol.DUALITY_REL)

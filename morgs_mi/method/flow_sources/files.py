@@ -107,16 +107,16 @@ def flow_files(folder: str, config: FlowConfig) -> FlowSource:
         raise FileNotFoundError(
             f"{folder}: expected a folder of flow files, found none; check the path."
         )
-    known: dict[Path, dict[int, Path]] = {}
+    numbered: dict[Path, dict[int, Path]] = {}
 
     def flow(pair: FramePair, direction: str, frame: int) -> np.ndarray:
         place = Path(folder) / pair.camera / direction
-        if frame not in known.get(place, {}):  # files may have been added since
+        if frame not in numbered.get(place, {}):  # files may have been added since
             content = listed(place) if place.is_dir() else ()
             paths = [path for path in content if path.suffix.lower() in _SUFFIXES]
             numbers = frame_numbers(place, [path.stem for path in paths]) if paths else ()
-            known[place] = dict(zip(numbers, paths, strict=True))
-        files = known[place]
+            numbered[place] = dict(zip(numbers, paths, strict=True))
+        files = numbered[place]
         if frame not in files:
             content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
             raise FileNotFoundError(

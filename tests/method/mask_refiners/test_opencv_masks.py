@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.evaluate.metrics import iou
-from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask, refine_mask, vote_superpixels
 from tests.method.moving_disc import moving_disc
 
@@ -36,7 +36,15 @@ def test_vote_superpixels__removes_specks():
     assert not vote_superpixels(image, specks, MaskConfig()).any()
 
 
-@pytest.mark.parametrize("size", [(1, 1), (40, 30), (700, 20)])
+@pytest.mark.parametrize("method", ["none", "grabcut", "superpixels+grabcut"])
+def test_mask_refiner__is_repeatable(method):
+    _, image, disc = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
+    refine = MASK_REFINERS.make(method)
+    for same in (image, (image * 255 + 0.5).astype(np.uint8)):
+        np.testing.assert_array_equal(refine(same, disc), refine(image, disc))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (700, 20)])
 @pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
 def test_refine_mask__and_vote_superpixels_accept_any_mask(refine, size):
     image = np.random.default_rng(0).random((*size, 3))

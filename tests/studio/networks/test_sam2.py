@@ -102,7 +102,8 @@ def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
     motion[110:125, 150:170] = 0  # a hole in the moving object
     motion[10:14, 10:40] = 3  # the network segments nothing here
     method = f"sam2:{files[0]},{files[1]}"
-    mask = motion_mask(image, motion, method=method)
+    reliable = np.ones((240, 320), bool)
+    mask = motion_mask(image, motion, reliable, method, MaskConfig())
     assert mask[motion[..., 0] > 0].all()
     assert mask[disc].all()
     assert MASK_REFINERS.make(method) is MASK_REFINERS.make(method)
