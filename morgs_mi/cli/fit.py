@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from annotated_types import Ge
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
@@ -23,7 +22,7 @@ from morgs_mi.cli.settings import (
     held_out,
     optional,
 )
-from morgs_mi.core.config import check_value, config_toml
+from morgs_mi.core.config import Count, check_value, config_toml
 from morgs_mi.core.documentation import page
 from morgs_mi.core.fit_names import STREAM
 
@@ -81,7 +80,7 @@ class Fit:
                 "options with several values, such as --test-view, and see morgs-mi fit --help."
             )
         if self.chunks is not None:
-            check_value("fit()", "chunks", self.chunks, Annotated[int, Ge(1)])
+            check_value("fit()", "chunks", self.chunks, Count)
         self.settings.check_methods(config)
         views = held_out(self.test_view)
         reading = self.reading.read_config()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Le
 
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import NonNegativeInt, Positive, config_class
 
 
 @config_class
@@ -21,7 +21,7 @@ class CodecConfig:
         ValueError: a number is out of range.
     """
 
-    quality: Annotated[float, Gt(0)] = 1.0
+    quality: Positive = 1.0
     """Divisor of the tolerated errors (see `core.attributes`): 2 doubles the precision of
     everything, 1000 is as good as float32."""
     birth_precision: Annotated[float, Ge(1), Le(1024)] = 4.0
@@ -30,10 +30,10 @@ class CodecConfig:
     """Storage of the learned offset of moving Gaussians, for viewing; no other value is decoded
     from it.
     """
-    target_size: Annotated[int, Ge(0)] = 0
+    target_size: NonNegativeInt = 0
     """Bound of the bytes of a later frame, which is coded more coarsely until it fits; 0: no bound.
     """
-    keyframe_interval: Annotated[int, Ge(0)] = 30
+    keyframe_interval: NonNegativeInt = 30
     """Frames between re-emitted keyframes, which contain the whole state and at which a reader can
     start; 0: never.
     """

@@ -28,7 +28,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.config import apply_values, check_value
+from morgs_mi.core.config import Count, apply_values, check_value
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.fit_names import REPORT
@@ -280,7 +280,7 @@ def fit_arms(
     """Return the scores of some arms, fitted where they are missing. They are fitted seed by seed,
     so that a change of the machine's load reaches all of them.
     """
-    check_value("sweep()", "seeds", seeds, Annotated[int, Ge(1)])
+    check_value("sweep()", "seeds", seeds, Count)
     check_value("sweep()", "frames", frames, Annotated[int, Ge(2)])
     capture = replace(capture, num_frames=min(frames, capture.num_frames))
     frame = next(capture.partial_frames(0, 1))

@@ -16,17 +16,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain, islice
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge
 
 from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.codec.container import Packet, decode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.config import config_class
+from morgs_mi.core.config import Count, NonNegativeInt, config_class
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.observation import Setup
 from morgs_mi.loop.stream_config import StreamConfig
@@ -56,13 +54,13 @@ class ChunkConfig:
     count: int = 1
     """Number of chunks of about the same length, of two frames at least; with one, the stream
     equals `stream_capture`'s."""
-    passes: Annotated[int, Ge(1)] = 24
+    passes: Count = 24
     """Fits of the first frame of the overlap, one after the other, each with a round of density
     control.
     """
-    epochs: Annotated[int, Ge(1)] = 4
+    epochs: Count = 4
     """Passes over all training views in each of them."""
-    overlap: Annotated[int, Ge(0)] = 10
+    overlap: NonNegativeInt = 10
     """Frames before a chunk that are fitted as well: its Gaussians then follow the recording from
     its first frame.
     """

@@ -15,19 +15,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import cv2
 import mitsuba as mi
 import numpy as np
-from annotated_types import Ge
 
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, few, require
 from morgs_mi.core.color_space import decode_light, encode_light
-from morgs_mi.core.config import check_ranges
+from morgs_mi.core.config import Count, check_ranges
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
@@ -54,7 +53,7 @@ _PLACE = "The inserted scene"  # where its errors begin
 class InsertConfig:
     """Rendering of an inserted scene."""
 
-    samples: Annotated[int, Ge(1)] = 16
+    samples: Count = 16
     """Samples per pixel of its surfaces."""
     shadows: bool = True
     """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""

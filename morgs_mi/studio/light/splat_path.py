@@ -28,14 +28,14 @@ from annotated_types import Ge
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
 
 from morgs_mi.core.checks import require
-from morgs_mi.core.config import check_value
+from morgs_mi.core.config import Count, check_value
 from morgs_mi.core.types import Bool, Float
 from morgs_mi.studio.light.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
 
 _PROPERTIES = {
     "max_depth": Annotated[int, Ge(-1)],
-    "rr_depth": Annotated[int, Ge(1)],
+    "rr_depth": Count,
     "clipped": Annotated[float, Ge(1)],
 }
 

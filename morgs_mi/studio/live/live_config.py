@@ -9,7 +9,7 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le
 
 from morgs_mi.core.checks import require
-from morgs_mi.core.config import check_ranges
+from morgs_mi.core.config import Count, Positive, check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 
@@ -32,9 +32,9 @@ class LiveConfig:
     """Factor by which the images are reduced."""
     test_view: tuple[str, ...] = ()
     """Held-out cameras, by indices or names; by default all are fitted."""
-    frames: Annotated[int, Ge(1)] | None = None
+    frames: Count | None = None
     """Number of frames to fit; by default as many as come."""
-    seconds: Annotated[float, Gt(0)] | None = None
+    seconds: Positive | None = None
     """Time in seconds for the frames after the first one; by default until the cameras end."""
     record: bool = True
     """Store the images of all fitted frames; otherwise of the first one alone."""

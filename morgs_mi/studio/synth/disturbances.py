@@ -22,7 +22,7 @@ from annotated_types import Ge, Le
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.config import check_ranges
+from morgs_mi.core.config import NonNegative, check_ranges
 from morgs_mi.core.files import write_json
 
 _FILE = "disturbances.json"
@@ -35,7 +35,7 @@ class Disturbances:
     The held-out camera is the reference: it has no time offset.
     """
 
-    time_offset: Annotated[float, Ge(0)] = 0.0
+    time_offset: NonNegative = 0.0
     """Largest time offset of a camera from cam00 in frames; drawn per camera."""
     rolling_shutter: Annotated[float, Ge(0), Le(1)] = 0.0
     """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about

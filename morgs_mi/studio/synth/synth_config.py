@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
+from morgs_mi.core.config import Count, NonNegativeInt
 from morgs_mi.core.documentation import documented
 from morgs_mi.studio.synth.disturbances import Disturbances
 
@@ -21,7 +22,7 @@ class SynthConfig:
 
     cameras: Annotated[int, Ge(2)] | None = None
     """Number of cameras, the held-out cam00 included; the scene's own, usually 10, if not given."""
-    frames: Annotated[int, Ge(1)] = 12
+    frames: Count = 12
     """Number of frames per camera."""
     width: Annotated[int, Ge(2), MultipleOf(2)] = 320
     """Width of the images in pixels, even."""
@@ -40,7 +41,7 @@ class SynthConfig:
     """Also write the frames as PNG files, which are read in place of the compressed videos."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     """Disturbances of the recording."""
-    seed: Annotated[int, Ge(0)] = 0
+    seed: NonNegativeInt = 0
     """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the
     scene random.
     """
