@@ -27,6 +27,7 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
+from tests.capture.layouts.test_colmap import as_binary
 from tests.scenes import captures as layouts
 from tests.scenes.captures import (
     COUNT,
@@ -55,14 +56,6 @@ def assert_holds(
         assert_close(camera.K, cameras[i].K, atol=PIXEL_ABS)
     for t, frame in enumerate(capture.frames()):
         assert [tuple(image[20, 30, :2]) for image in frame.images] == [(i, t) for i in order]
-
-
-def test_poses_bounds__reads_n3dv_with_missing_camera_numbers(tmp_path: Path) -> None:
-    capture = load_capture(layouts.n3dv(tmp_path / "a"))
-    assert (capture.layout, capture.fps, capture.truth) == ("poses_bounds", FPS, None)
-    assert capture.points.shape == capture.point_colors.shape == (0, 3)
-    assert_holds(capture, ("cam00", "cam02", "cam11"), (0, 1, 2))
-    assert [frame.index for frame in capture.frames(1, 2)] == [1]
 
 
 @pytest.mark.parametrize(
@@ -100,30 +93,22 @@ def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
 def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
     names = ("cam10", "cam2", "cam1")
     focals, coefficients = MODELS[model]
-    cameras = rig(names)
     lens = [0.01 * (k + 1) for k in range(coefficients)]
     params = [[50.0 + i] * focals + [33.0, 20.0 + i, *lens] for i in range(3)]
     folder = tmp_path / "sparse" / "0"
-    layouts.colmap_text(folder, cameras, model, params, shared)
+    layouts.colmap_text(folder, rig(names), model, params, shared)
     if kind == "bin":
-        converted = pycolmap.Reconstruction(str(folder))
-        for file in folder.iterdir():
-            file.unlink()
-        converted.write_binary(str(folder))
+        as_binary(folder)
     (folder_per_camera if shared else layouts.videos)(tmp_path, names)
     capture = load_capture(tmp_path)
     assert (capture.layout, capture.names) == ("COLMAP", ("cam1", "cam2", "cam10"))
-    for camera, i in zip(capture.cameras, (2, 1, 0), strict=True):
-        assert_close(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
+    for view, i in zip(capture.metadata()["cameras"], (2, 1, 0), strict=True):
         number = 0 if shared else i
         np.testing.assert_allclose(
-            camera.K, [[50 + number, 0, 33], [0, 50 + number, 20 + number], [0, 0, 1]]
+            view["K"], [[50 + number, 0, 33], [0, 50 + number, 20 + number], [0, 0, 1]]
         )
-    metadata = capture.metadata()
-    assert [view["lens"] for view in metadata["cameras"]] == [model] * 3
-    np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
-    np.testing.assert_allclose(capture.points, [[0.1, 0.2, 0.3]], rtol=1e-6)
-    assert_close(capture.point_colors, [[1, 0, 0.2]], atol=1e-6)
+        assert view["lens"] == model
+        np.testing.assert_allclose(view["distortion"], lens)
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [2, 1, 0]
 
 
@@ -158,19 +143,10 @@ def test_find_reader__follows_the_order_of_precedence(tmp_path: Path) -> None:
     assert load_capture(meta).layout == "Nerfstudio"
 
 
-def colmap_by_frame(path: Path) -> Path:
-    layouts.colmap(path)
-    for file in path.glob("*.mkv"):
-        file.unlink()
-    folder_per_frame(path, ("cam1", "cam2", "cam10"))
-    return path
-
-
 @pytest.mark.parametrize(
     ("build", "clip", "camera", "left"),
     [
         (layouts.colmap, "cam2.mkv", "cam2.png", ("cam1", "cam10")),
-        (colmap_by_frame, "frame*/cam2.png", "cam2.png", ("cam1", "cam10")),
         (layouts.nerfstudio, "cam2.mkv", "./images/cam2.png", ("cam1", "cam10")),
         (layouts.dynamic3dgs, "ims/2/*", "2", ("1", "10")),
         (
@@ -204,23 +180,9 @@ def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
     assert f"{camera}: left out." in warning or f"{camera} was found: left out." in warning
     assert capture.names == left
     whole = load_capture(build(tmp_path / "b"))
-    for camera_, expected in zip(
-        capture.cameras, (whole.cameras[whole.names.index(n)] for n in left), strict=True
-    ):
-        assert_close(camera_.viewmat, expected.viewmat, atol=POSE_ABS)
-
-
-def test_load_capture__lists_some_of_many_cameras_without_clips(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    names = tuple(f"cam{i}" for i in range(30))
-    layouts.colmap_text(
-        tmp_path / "sparse", rig(names), "PINHOLE", [[50.0, 50, 31, 23]], shared=True
-    )
-    layouts.videos(tmp_path, names[:2])
-    with caplog.at_level(logging.WARNING):
-        assert load_capture(tmp_path).names == names[:2]
-    assert "cam11.png and 18 more: left out." in caplog.text
+    expected = {camera.name: camera.viewmat for camera in whole.cameras}
+    for camera_ in capture.cameras:
+        assert_close(camera_.viewmat, expected[camera_.name], atol=POSE_ABS)
 
 
 def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
@@ -271,27 +233,6 @@ def test_find_reader__finds_a_layout_that_is_added(
     assert load_capture(path).layout == "poses_bounds"
 
 
-def test_clips_by_camera__ignores_folders_without_clips(tmp_path: Path) -> None:
-    path = layouts.n3dv(tmp_path / "a")
-    for place in (
-        "images/cam05.png",
-        "frames/cam05.png",
-        "truth/cam05/0000.png",
-        "masks/cam05/0.png",
-        "seg/cam05/0.png",
-    ):
-        layouts.write_image(path / place, 0, 0)
-    assert load_capture(path).names == ("cam00", "cam02", "cam11")
-
-
-def test_nerfstudio__reads_cameras(tmp_path: Path) -> None:
-    path = layouts.nerfstudio(tmp_path / "a")
-    capture = load_capture(path)
-    assert (capture.layout, len(capture.points)) == ("Nerfstudio", 0)
-    assert_holds(capture, ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
-    assert capture.metadata()["cameras"][0]["distortion"] == [0.01, 0, 0, 0]
-
-
 def edit(path: Path, change, name: str = "transforms.json") -> None:
     meta = json.loads((path / name).read_text())
     change(meta)
@@ -318,33 +259,6 @@ def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path: Path) -> Non
         "FULL_OPENCV",
         [0.02, 0, 0, 0.03, 0.05, 0, 0, 0],
     )
-
-
-def test_nerfstudio__reads_all_frames_and_points(tmp_path: Path) -> None:
-    path = layouts.nerfstudio(tmp_path / "a")
-    for file in path.glob("*.mkv"):
-        file.unlink()
-    folder_per_camera(path / "images", ("cam1", "cam2", "cam10"))
-
-    def change(meta: dict) -> None:
-        meta.update(ply_file_path="cloud.ply")
-        single = meta["frames"]
-        meta["frames"] = []
-        for frame in single:
-            folder = frame["file_path"].removesuffix(".png")
-            meta["frames"] += [frame | {"file_path": f"{folder}/{t:04d}.png"} for t in range(COUNT)]
-
-    edit(path, change)
-    vertex = np.array(
-        [(1, 2, 3, 255, 0, 51)],
-        [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")],
-    )
-    PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path / "cloud.ply"))
-    capture = load_capture(path)
-    assert capture.names == ("cam1", "cam2", "cam10")
-    np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
-    np.testing.assert_allclose(capture.point_colors, [[1, 0, 0.2]])
-    assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
 def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
@@ -551,12 +465,6 @@ def test_match_clips__reads_folders_of_folders(
     assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
-def test_clips_by_camera__names_the_videos_of_memory_cards_by_their_folders(tmp_path: Path) -> None:
-    for name in ("cam02", "cam10", "cam01"):
-        layouts.videos(tmp_path / name, ("GX010042",))
-    assert [*clips_by_camera(tmp_path)] == ["cam01", "cam02", "cam10"]
-
-
 def test_anipose__reads_the_names_of_pose2sim(tmp_path: Path) -> None:
     path = layouts.anipose(
         tmp_path / "a", clips=lambda path, _: layouts.videos(path, ("A", "B", "C"))
@@ -573,10 +481,15 @@ def test_colmap__reads_points_of_several_files_or_none(tmp_path: Path, kind: str
     if kind != "txt":
         file.unlink()
     if kind == "ply":
-        vertex = np.array([(0.1, 0.2, 0.3)], [(axis, "f8") for axis in "xyz"])
+        vertex = np.array(
+            [(0.1, 0.2, 0.3, 255, 0, 51)],
+            [(axis, "f8") for axis in "xyz"] + [(band, "u1") for band in ("red", "green", "blue")],
+        )
         PlyData([PlyElement.describe(vertex, "vertex")]).write(str(file.with_suffix(".ply")))
-    points = load_capture(path).points
-    assert_close(points, [[0.1, 0.2, 0.3]] if kind else np.zeros((0, 3)), atol=1e-6)
+    capture = load_capture(path)
+    count = 1 if kind else 0
+    assert_close(capture.points, np.array([[0.1, 0.2, 0.3]])[:count], atol=1e-6)
+    assert_close(capture.point_colors, np.array([[1, 0, 0.2]])[:count], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -599,13 +512,6 @@ def test_colmap__uses_its_masks(tmp_path: Path, mask: str) -> None:
     capture = load_capture(path)
     assert capture.masks[::2] == (None, None)
     np.testing.assert_array_equal(capture.masks[1], left > 0)
-
-
-def test_colmap__names_masks_of_no_image(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = layouts.colmap(tmp_path / "a")
-    layouts.write_image(path / "masks/cam3.png", 0, 0)
-    load_capture(path)
-    assert "no mask is named after an image, such as cam1.png.png" in caplog.text
 
 
 # Easting, northing and height of a rig, m.

@@ -92,18 +92,13 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
     wrong = rng.random(len(tracks.ids)) < 0.1
     tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
     changes, points = bundle_adjust(start, tracks, priors_of(start))
+    assert np.abs(changes[:, 6]).max() > 1e-3
+    assert abs(changes[:, 6].mean()) < 1e-6, "the mean focal length stays"
     cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
     projected = np.concatenate([camera.project(points)[0] for camera in cameras])
     assert np.median(np.linalg.norm(projected - tracks.pixels, axis=1)[~wrong]) < 0.02
     relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (cameras, true)]
     assert np.rad2deg(np.arccos((np.trace(relative[0].T @ relative[1]) - 1) / 2)) < 0.02
-
-
-@pytest.mark.slow
-def test_bundle_adjust__leaves_cameras_that_fit():
-    true = rig()
-    changes, _ = bundle_adjust(true, seen_by(true), priors_of(true))
-    assert np.abs(changes).max() < 1e-6
 
 
 @pytest.mark.parametrize("seed", [3, 5])
@@ -118,21 +113,12 @@ def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(se
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
     start = intersect(tracks.ids, tracks.views, tracks.pixels, rig_of_nine, tracks.count)
     _, end = bundle_adjust(rig_of_nine, tracks, priors_of(rig_of_nine))
-    shifts = [
-        unseen.project(positions)[0] - unseen.project(points)[0] for positions in (start, end)
-    ]
-    errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
+    pixels = np.array([unseen.project(positions)[0] for positions in (points, start, end)])
+    errors = np.median(np.linalg.norm(pixels[1:] - pixels[0], axis=2), axis=1)
     assert errors[1] < errors[0] + 0.03
 
 
-def test_bundle_adjust__changes_focal_lengths_by_zero_on_average():
-    start = disturbed(rig(shift=7), np.random.default_rng(1))
-    changes, _ = bundle_adjust(start, seen_by(rig(shift=7)), priors_of(start))
-    assert np.abs(changes[:, 6]).max() > 1e-3
-    assert abs(changes[:, 6].mean()) < 1e-6
-
-
-@pytest.mark.parametrize(("noise", "most"), [(0.0, 0.05), (0.3, 0.3), (3.0, 1.0)])
+@pytest.mark.parametrize(("noise", "most"), [(0.0, 0.05), (3.0, 1.0)])
 def test_likely_deviations__are_small_where_features_reproject_well(noise, most):
     tracks = seen_by(rig())
     tracks.pixels[:] += np.random.default_rng(0).normal(scale=noise, size=tracks.pixels.shape)

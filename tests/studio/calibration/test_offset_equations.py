@@ -66,10 +66,6 @@ def equations(
     )
 
 
-def test_solution__tells_how_far_each_view_is_ahead() -> None:
-    np.testing.assert_allclose(equations(turning_ball()).solution(), OFFSETS, atol=0.06)
-
-
 def test_solution__has_a_mean_of_zero_over_the_training_views() -> None:
     held_out = equations(turning_ball(), held_out=[0])
     assert not held_out.matrix[1:, 0].any()
@@ -84,8 +80,9 @@ def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places(
     )
 
 
-def test_solution__adds_what_the_fit_hides() -> None:
+def test_solution__is_how_far_each_view_is_ahead_with_what_the_fit_hides() -> None:
     system = equations(turning_ball())
+    np.testing.assert_allclose(system.solution(), OFFSETS, atol=0.06)
     np.testing.assert_allclose(system.solution(share=0.5), 2 * system.solution())
 
 

@@ -60,10 +60,11 @@ def disturbed(cameras, scale: float = 1.0) -> list:
     return [changed_camera(c, scale * s * WRONG) for c, s in zip(cameras, signs, strict=True)]
 
 
-def relative_turns(cameras) -> np.ndarray:
-    """Return the angles between the viewing directions of each two cameras, degrees."""
-    rays = np.array([camera.viewmat[2, :3] for camera in cameras])
-    return np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1, 1)))[np.triu_indices(len(rays), 1)]
+def turn_error(cameras, true) -> float:
+    """Return the largest error of an angle between two viewing directions, degrees."""
+    rays = (np.array([camera.viewmat[2, :3] for camera in rig]) for rig in (cameras, true))
+    angles = [np.arccos(np.clip(r @ r.T, -1, 1)) for r in rays]
+    return np.rad2deg(np.abs(angles[0] - angles[1]).max())
 
 
 def capture_of(
@@ -101,33 +102,28 @@ def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return capture_of(tmp_path_factory.mktemp("far"), gaussians, cameras, test_view=4, noise=5)
 
 
-def shift_of_splats(capture: Capture, true: Capture) -> float:
-    """Return the median distance of the splats in training cameras from the true ones, px."""
-    means = np.asarray(true.points, float)
-    pairs = [(capture.cameras[v], true.cameras[v]) for v in true.train_views]
-    return float(
-        np.median(
-            [np.linalg.norm(a.project(means)[0] - b.project(means)[0], axis=1) for a, b in pairs]
-        )
-    )
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("scale", "most"), [(0.0, 0.35), (1.0, 0.35)])
-@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, scale, most, seed):
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, scale, seed):
     """Noise alone moves correct cameras by 0.2 to 0.3 px; disturbed ones show the splats 0.6 to 0.8
     px off.
     """
     deviations = scale * np.array([0.005] * 3 + [0.006] * 3 + [0.008, 0, 0, 0, 0])
     errors = deviations * np.random.default_rng(seed).normal(size=(9, 11))
     errors[list(far_capture.test_views)] = 0
-    cameras = [changed_camera(*pair) for pair in zip(far_capture.cameras, errors, strict=True)]
-    capture = replace(far_capture, cameras=tuple(cameras))
+    capture = replace(far_capture, cameras=tuple(map(changed_camera, far_capture.cameras, errors)))
     config = FitConfig(refine_cameras="on", short_fits=replace(SHORT, steps=100))
     refined, _ = refine_cameras(capture, config, RenderConfig(), seed)
-    old_shift, new_shift = (shift_of_splats(each, far_capture) for each in (capture, refined))
-    assert new_shift < max(most, 0.9 * old_shift)
+    # The positions of the splats in training cameras.
+    pixels, old_pixels, new_pixels = (
+        np.array([each.cameras[v].project(far_capture.points)[0] for v in each.train_views])
+        for each in (far_capture, capture, refined)
+    )
+    old_shift, new_shift = (
+        np.median(np.linalg.norm(each - pixels, axis=-1)) for each in (old_pixels, new_pixels)
+    )
+    assert new_shift < max(0.35, 0.9 * old_shift)
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
@@ -138,15 +134,12 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 0.0, RenderConfig())
-    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
-    errors = [
-        np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (start, cameras)
-    ]
-    assert errors[1] < 0.15 * errors[0]
+    cameras = list(map(changed_camera, start, changes))
+    assert turn_error(cameras, CAMERAS) < 0.15 * turn_error(start, CAMERAS)
     assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
 
-@pytest.mark.parametrize("scale", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("scale", [0.0, 1.0])
 def test_register_camera__finds_the_camera_of_an_image(scale):
     start = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
@@ -161,15 +154,6 @@ def test_moved__keeps_the_projections_of_points():
     assert_close(_moved(points, CAMERAS, changes), points + changes[0, 3:6], rtol=0, atol=1e-5)
 
 
-def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_capture, monkeypatch):
-    # So short fits differ by tenths of a dB by chance, but by less than this.
-    monkeypatch.setattr("morgs_mi.studio.calibration.refine.LEAST_GAIN", 3)
-    refined, refinement = refine_cameras(splat_capture, LEAST)
-    assert not refinement.taken
-    assert refined is splat_capture
-    assert "stay as calibrated" in refinement.sentence
-
-
 @pytest.mark.parametrize(("gain", "accepted"), [(0.05, False), (0.2, True)])
 def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(
     splat_capture, monkeypatch, gain, accepted
@@ -178,6 +162,7 @@ def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.mean_psnr", lambda *_: next(scores))
     refined, refinement = refine_cameras(splat_capture, LEAST)
     assert refinement.taken is accepted
+    assert ("stay as calibrated" in refinement.sentence) is not accepted
     assert (refined is splat_capture) is not accepted
     assert refined.cameras[0] is splat_capture.cameras[0], "the held-out view stays as calibrated"
     assert np.array_equal(refined.points, splat_capture.points) is not accepted
@@ -211,8 +196,7 @@ def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_
     true, start, result = (
         [c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined)
     )
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, result)]
-    assert errors[1] < 0.5 * errors[0], "two rounds, where the default has five"
+    assert turn_error(result, true) < 0.5 * turn_error(start, true), "two rounds of five"
 
 
 def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_capture):
@@ -222,18 +206,22 @@ def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_c
     assert refined is not splat_capture
 
 
+def matched(capture: Capture) -> tuple[np.ndarray, int]:
+    """Return the changes of the training cameras by features, and the number of tracks."""
+    extent = scene_extent([capture.cameras[v] for v in capture.train_views])
+    deviations = prior_deviations(extent, CameraPriors())
+    return _matched(capture, capture.train_views, deviations)[:2]
+
+
 @pytest.mark.slow
 def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
     start, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
-    changes, tracks, _ = _matched(
-        capture, capture.train_views, prior_deviations(scene_extent(start), CameraPriors())
-    )
-    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, cameras)]
+    changes, tracks = matched(capture)
+    cameras = list(map(changed_camera, start, changes))
     assert tracks > 100
-    assert errors[1] < 0.1 * errors[0]
+    assert turn_error(cameras, true) < 0.1 * turn_error(start, true)
 
 
 @pytest.mark.slow
@@ -241,10 +229,7 @@ def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatc
     monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
     terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]
     bent = textured_capture.with_cameras(textured_capture.cameras, terms)
-    cameras = [bent.cameras[v] for v in bent.train_views]
-    changes, *_ = _matched(
-        bent, bent.train_views, prior_deviations(scene_extent(cameras), CameraPriors())
-    )
+    changes, _ = matched(bent)
     # Images that were undistorted without need have the opposite distortion.
     assert_close(changes[:, 9], [-terms[v][0] for v in bent.train_views], atol=0.03)
 

@@ -31,10 +31,9 @@ def test_draw_rig__draws_cameras_at_their_positions() -> None:
     figure = Figure()
     draw_rig(figure, cameras, (points, green), test_views=(1,))
     above = figure.axes[0]
-    assert_close(
-        np.array([name.xy for name in above.texts[:3]]), [(-1, 0), (0, 0), (1, 0)], atol=1e-6
-    )
-    assert [name.get_text() for name in above.texts[:3]] == ["0", "1", "2"]
+    names = above.texts[:3]
+    assert_close(np.array([name.xy for name in names]), [(-1, 0), (0, 0), (1, 0)], atol=1e-6)
+    assert [name.get_text() for name in names] == ["0", "1", "2"]
     frusta = above.lines[::2]
     assert [same_color(line.get_color(), "tab:red") for line in frusta] == [False, True, False]
     # Ahead of the cameras is up.
@@ -45,7 +44,7 @@ def test_draw_rig__draws_cameras_at_their_positions() -> None:
     assert np.mean(above.get_xlim()) == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.parametrize("count", [1, 2, 8])
+@pytest.mark.parametrize("count", [1, 8])
 def test_draw_rig__draws_any_rig(count: int) -> None:
     cameras = look_at_cameras(circle(2 * np.pi * np.arange(count) / count, z=0), 60, up=(0, 0, 1))
     figure = Figure()

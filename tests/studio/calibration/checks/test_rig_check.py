@@ -13,6 +13,8 @@ from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_p
 from morgs_mi.studio.calibration.checks.rig_check import check_rig
 from tests.scenes.textured import turned, with_cameras
 
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
 
 @pytest.mark.slow
 def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures) -> None:
@@ -25,8 +27,7 @@ def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures)
     # The images are exact; SIFT locates features to some hundredths of a pixel.
     assert check.error < 0.05
     assert max(camera.error for camera in check.cameras) < 0.1
-    assert [camera.verdict for camera in check.cameras] == 6 * ["fits"]
-    assert not any(camera.advice for camera in check.cameras)
+    assert [(camera.verdict, camera.advice) for camera in check.cameras] == 6 * [("fits", "")]
 
 
 def test_check_rig__does_not_check_a_camera_without_matches(
@@ -50,22 +51,14 @@ def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(
     some = tuple(match for match in shared.matches if 5 not in match.views or match.views == (4, 5))
     wrong = with_cameras(capture, lambda i, c: turned(c, 20) if i == 4 else c)
     check = check_rig(wrong, SharedFeatures(shared.features, some))
-    assert [camera.verdict for camera in check.cameras] == [
-        *4 * ["fits"],
-        "does not fit",
-        "not checked",
-    ]
+    assert [camera.fits for camera in check.cameras] == [*4 * [True], False, None]
     assert "matches only with cameras that do not fit" in check.cameras[5].advice
 
 
 def test_check_rig__is_undecided_without_matches(capture: Capture) -> None:
-    blank = detect(np.full((48, 64, 3), 128, np.uint8))
-    assert blank.points.shape == (0, 2)
-    check = check_rig(
-        capture, SharedFeatures((blank,) * 6, tuple(match_views([blank] * 6, capture.cameras)))
-    )
-    assert check.fits is None
-    assert check.matches == 0
+    blank = (detect(np.full((48, 64, 3), 128, np.uint8)),) * 6
+    check = check_rig(capture, SharedFeatures(blank, tuple(match_views(blank, capture.cameras))))
+    assert (check.fits, check.matches) == (None, 0)
     assert np.isnan(check.error)
     assert "too few matches" in check.advice
 
@@ -88,18 +81,13 @@ def test_triangulate_points__ignores_the_held_out_view(
     assert len(points.points) == len(points.point_colors) > 1000
     held_out = replace(capture, test_views=(3,))
     fewer = triangulate_points(held_out, shared)
-    blind = SharedFeatures(
-        tuple(
-            detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f
-            for i, f in enumerate(shared.features)
-        ),
-        tuple(match for match in shared.matches if 3 not in match.views),
-    )
+    features = list(shared.features)
+    features[3] = detect(None)
+    others = tuple(match for match in shared.matches if 3 not in match.views)
+    blind = SharedFeatures(tuple(features), others)
     np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
     assert len(fewer.points) < len(points.points)
-    wrong = with_cameras(
-        capture, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat)
-    )
+    wrong = with_cameras(capture, lambda _, c: replace(c, viewmat=FLIP @ c.viewmat))
     assert len(triangulate_points(wrong, shared).points) == 0
 
 
@@ -113,10 +101,9 @@ def test_match_capture__finds_features_at_the_recorded_size(
     assert check_rig(small, matches).error == pytest.approx(
         check_rig(capture, shared).error, abs=0.01
     )
-    few = triangulate_points(small, matches)
-    all_ = triangulate_points(capture, shared)
-    assert len(few.points) == pytest.approx(len(all_.points), rel=0.01)
-    assert few.cameras is small.cameras
+    points = triangulate_points(small, matches).points
+    count = len(triangulate_points(capture, shared).points)
+    assert len(points) == pytest.approx(count, rel=0.01)
 
 
 def test_triangulate_points__matches_distant_views_with_their_poses(
@@ -128,9 +115,5 @@ def test_triangulate_points__matches_distant_views_with_their_poses(
     unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
     points = triangulate_points(ends, unmatched)
     assert len(points.points) > 50
-    depth = [camera.project(points.points)[1] for camera in ends.cameras]
-    assert np.min(depth) > 1
-    wrong = with_cameras(
-        ends, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat) if i else c
-    )
+    wrong = with_cameras(ends, lambda i, c: replace(c, viewmat=FLIP @ c.viewmat) if i else c)
     assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)
