@@ -20,13 +20,13 @@ import morgs_mi
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.extras.demo.demo import DemoConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.loop.observation import FrameObservation, observe_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.playback.visualise import confidence_image, grey_image, motion_image, to_uint8
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.studio.demo import DemoConfig
-from morgs_mi.studio.synth.synthesize import synthesize
 
 _CAPTURE = Path("out/demo/capture")
 _OUT = Path("docs/how-it-works")

@@ -10,6 +10,12 @@ from .core.progress import ProgressBar
 from .core.rig import with_near_planes
 from .evaluate.accuracy import accuracy
 from .evaluate.evaluate import evaluate_stream
+from .extras.light.light_probe import light_probe
+from .extras.light.shadows import shadow_ratio, shadowed
+from .extras.live.sources import live_frames
+from .extras.sweep.sweep import leave_out, sweep
+from .extras.synth.synth_config import SynthConfig
+from .extras.synth.synthesize import synthesize
 from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
 from .io.ply import write_ply
@@ -26,12 +32,6 @@ from .render.rasterize import Image, rasterize
 from .render.render_config import RenderConfig
 from .runs.fit_capture import stream_capture
 from .stream_loop import StreamLoop
-from .studio.light.light_probe import light_probe
-from .studio.light.shadows import shadow_ratio, shadowed
-from .studio.live.sources import live_frames
-from .studio.sweep import leave_out, sweep
-from .studio.synth.synth_config import SynthConfig
-from .studio.synth.synthesize import synthesize
 from .surfaces.splat_rays import SplatRays
 
 __all__ = [

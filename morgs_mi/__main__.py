@@ -2,6 +2,6 @@
 
 import sys
 
-from morgs_mi.cli import main
+from morgs_mi.cli.main import main
 
 sys.exit(main())

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.studio.synth.scene import Object, Rig, Scene, rotate, translate
-from morgs_mi.studio.synth.shapes import ball, box, disk, rod
-from morgs_mi.studio.synth.textures import lights, pattern, room, textured
+from morgs_mi.extras.synth.scene import Object, Rig, Scene, rotate, translate
+from morgs_mi.extras.synth.shapes import ball, box, disk, rod
+from morgs_mi.extras.synth.textures import lights, pattern, room, textured
 
 UPPER = 0.70
 FORE = 0.60

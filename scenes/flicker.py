@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.studio.synth.scene import Light, Object, Scene, rotate, translate
-from morgs_mi.studio.synth.shapes import ball, box, disk, rod
-from morgs_mi.studio.synth.textures import RGB, lights, pattern, room, textured
+from morgs_mi.extras.synth.scene import Light, Object, Scene, rotate, translate
+from morgs_mi.extras.synth.shapes import ball, box, disk, rod
+from morgs_mi.extras.synth.textures import RGB, lights, pattern, room, textured
 
 
 def build(seed: int = 0) -> Scene:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi import Camera
-from morgs_mi.studio.synth.scene import (
+from morgs_mi.extras.synth.scene import (
     Light,
     Object,
     RecordingDefaults,
@@ -27,8 +27,8 @@ from morgs_mi.studio.synth.scene import (
     rotate,
     translate,
 )
-from morgs_mi.studio.synth.shapes import ball, box, disk, rod
-from morgs_mi.studio.synth.textures import lights, pattern, room, textured
+from morgs_mi.extras.synth.shapes import ball, box, disk, rod
+from morgs_mi.extras.synth.textures import lights, pattern, room, textured
 
 WIDTH = 320
 HEIGHT = 240

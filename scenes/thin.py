@@ -12,9 +12,9 @@ from functools import partial
 
 import numpy as np
 
-from morgs_mi.studio.synth.scene import Object, Scene, rotate, translate
-from morgs_mi.studio.synth.shapes import ball, box, rod
-from morgs_mi.studio.synth.textures import RGB, lights, pattern, room, textured
+from morgs_mi.extras.synth.scene import Object, Scene, rotate, translate
+from morgs_mi.extras.synth.shapes import ball, box, rod
+from morgs_mi.extras.synth.textures import RGB, lights, pattern, room, textured
 
 BLADES = 3
 BLADE = 0.62

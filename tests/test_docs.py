@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import morgs_mi
-import morgs_mi.studio
+import morgs_mi.extras
 
 ROOT = Path(__file__).parents[1]
 GENERATED = ("docs/_build/", "docs/_extensions/", "docs/notebooks/", "docs/api/morgs_mi")
@@ -71,7 +71,7 @@ def test_equation_table__functions_name_their_equation():
 
 def test_architecture__lists_every_subpackage():
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", PAGES["docs/architecture.md"], re.MULTILINE)
-    folders = [*morgs_mi.__path__, *morgs_mi.studio.__path__]
+    folders = [*morgs_mi.__path__, *morgs_mi.extras.__path__]
     names = {module.name for module in pkgutil.iter_modules(folders)}
     assert set(re.findall(r"\w+", " ".join(rows))) == names - {"__main__"}
 

@@ -36,7 +36,7 @@ from morgs_mi import ProgressBar as Bar
 from morgs_mi.codec.frame_source import play
 from morgs_mi.playback.export.clips import write_each
 from morgs_mi.playback.export.web import write_web_page
-from morgs_mi.studio.import_frames import import_frames
+from morgs_mi.extras.imports.import_frames import import_frames
 from morgs_mi.io.ply import write_ply
 from tests.scenes.changing_splats import rig, splats
 from tests.scenes.recording import CONFIG, write_recording

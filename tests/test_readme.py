@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.cli import COMMANDS
-from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
+from morgs_mi.cli.main import COMMANDS
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -60,12 +60,12 @@ VALUES: dict[str, Any] = {
 ELSEWHERE: dict[str, str] = {
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
-    "fit.camera_priors": "the recorder refines cameras: tests/studio/calibration/test_bundle.py",
+    "fit.camera_priors": "the recorder refines cameras: tests/extras/calibration/test_bundle.py",
     "fit.short_fits": (
-        "no cameras are refined here: tests/studio/calibration/test_refine.py, "
+        "no cameras are refined here: tests/extras/calibration/test_refine.py, "
         "tests/fit/test_balance.py"
     ),
-    "fit.refine_cameras": "the recorder refines cameras: tests/studio/calibration/test_refine.py",
+    "fit.refine_cameras": "the recorder refines cameras: tests/extras/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_dropout.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",

@@ -38,12 +38,12 @@ EXCEPTIONS = {
     "benchmarks/reports/field.py": {"found"},
     "benchmarks/reports/plots.py": {"about"},
     "morgs_mi/fit/balance.py": {"taken"},
-    "morgs_mi/studio/calibration/offset_equations.py": {"own"},
-    "morgs_mi/studio/calibration/refine.py": {"taken"},
-    "morgs_mi/studio/import_frames.py": {"before", "now"},
-    "morgs_mi/studio/live/cameras.py": {"after"},
-    "morgs_mi/studio/synth/ground_truth.py": {"before", "after"},
-    "morgs_mi/studio/synth/sensor.py": {"own"},
+    "morgs_mi/extras/calibration/offset_equations.py": {"own"},
+    "morgs_mi/extras/calibration/refine.py": {"taken"},
+    "morgs_mi/extras/imports/import_frames.py": {"before", "now"},
+    "morgs_mi/extras/live/cameras.py": {"after"},
+    "morgs_mi/extras/synth/ground_truth.py": {"before", "after"},
+    "morgs_mi/extras/synth/sensor.py": {"own"},
 }
 
 

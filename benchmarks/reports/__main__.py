@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import tyro
 
 from benchmarks.reports import codec, method, renderer, stability
-from morgs_mi.cli import Common, run
+from morgs_mi.cli.main import Common, run
 from morgs_mi.cli.settings import one_command
 
 SUBJECTS = {

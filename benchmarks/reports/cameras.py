@@ -34,13 +34,13 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import scene_extent
+from morgs_mi.extras.calibration.bundle import changed_camera
+from morgs_mi.extras.calibration.refine import refine_cameras, register_camera
+from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
+from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.studio.calibration.bundle import changed_camera
-from morgs_mi.studio.calibration.refine import refine_cameras, register_camera
-from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
-from morgs_mi.studio.synth.synth_config import SynthConfig
 
 _FOCAL_ERROR = 0.01
 _RIGS = "true", "disturbed", "refined"

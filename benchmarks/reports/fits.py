@@ -19,11 +19,11 @@ from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
 
 DEFAULT = "default"  # name of the settings without a preset
 

@@ -29,12 +29,12 @@ from morgs_mi import Gaussians, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.progress import Progress
+from morgs_mi.extras.calibration.refine import register_camera
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.visualise import label, side_by_side
 from morgs_mi.runs.fit_capture import with_points
-from morgs_mi.studio.calibration.refine import register_camera
 
 COLUMNS = (
     Column("held out, dB", "held_out"),

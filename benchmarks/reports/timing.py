@@ -23,10 +23,10 @@ from benchmarks.reports.random_scenes import scores_of
 from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.evaluate.results import known_mean
+from morgs_mi.extras.calibration.timing import estimate_time_offsets
+from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.fit_capture import push_frame
-from morgs_mi.studio.calibration.timing import estimate_time_offsets
-from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
 
 _TIME_OFFSET = 1.5  # largest one, in frames
 COLUMNS = (

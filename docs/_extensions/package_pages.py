@@ -21,7 +21,7 @@ import morgs_mi
 
 # Modules of the integrators, which can be imported once a variant is set; Mitsuba's users read
 # their docstrings.
-PER_VARIANT = {"morgs_mi.surfaces.gaussian_splat", "morgs_mi.studio.light.splat_path"}
+PER_VARIANT = {"morgs_mi.surfaces.gaussian_splat", "morgs_mi.extras.light.splat_path"}
 NOTEBOOK = re.compile(r"\]\((?:\.\./)+notebooks/(\w+)\.ipynb\)")
 
 

@@ -1,4 +1,4 @@
-"""What `morgs_mi.studio` adds to the registries of the package: the only place outside of it that
+"""What `morgs_mi.extras` adds to the registries of the package: the only place outside of it that
 names the studio.
 
 A registry is a table in the module that uses it, such as the commands of `morgs_mi.cli`. An entry
@@ -40,12 +40,12 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
     "mask refiners": {"sam2": "networks.sam2:sam2"},
     "image distances": {"lpips": "networks.lpips:Lpips"},
 }
-"""Entries by registry and name, as MODULE or MODULE:NAME inside `morgs_mi.studio`."""
+"""Entries by registry and name, as MODULE or MODULE:NAME inside `morgs_mi.extras`."""
 
 
 def place_of(registry: str, name: str) -> str:
     """Return the full place of an entry, MODULE or MODULE:NAME."""
-    return f"morgs_mi.studio.{STUDIO[registry][name]}"
+    return f"morgs_mi.extras.{STUDIO[registry][name]}"
 
 
 def studio_entry(registry: str, name: str) -> Any:

@@ -16,8 +16,8 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.camera import Camera
+from morgs_mi.extras.calibration.calibrate import calibrate
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.studio.calibration.calibrate import calibrate
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import (

@@ -20,10 +20,10 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
 from tests.quick import SHORT_FITS
 from tests.scenes import captures as layouts
 from tests.scenes.changing_splats import splats

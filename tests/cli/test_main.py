@@ -181,7 +181,7 @@ def test_main__reports_an_unexpected_error_in_one_sentence(capture, run, monkeyp
     def fail(*_: object, **__: object) -> None:
         raise AttributeError("'NoneType' object has no attribute 'a'")
 
-    monkeypatch.setattr("morgs_mi.studio.commands.captures.load_capture", fail)
+    monkeypatch.setattr("morgs_mi.extras.calibration.command.load_capture", fail)
     assert_refused(
         run("info", capture),
         "Unexpected AttributeError: 'NoneType' object has no attribute 'a'",

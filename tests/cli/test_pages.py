@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
 from tests.quick import SHORT_FITS
 from tests.scenes.changing_splats import splats
 
@@ -69,8 +69,8 @@ def test_commands__of_a_page_run_to_the_end(page, recordings, tmp_path, run, mon
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")
     # Of `info --time`, which has no options.
-    monkeypatch.setattr("morgs_mi.studio.calibration.timing.GAUSSIANS", 500)
-    monkeypatch.setattr("morgs_mi.studio.calibration.timing.STEPS", 40)
+    monkeypatch.setattr("morgs_mi.extras.calibration.timing.GAUSSIANS", 500)
+    monkeypatch.setattr("morgs_mi.extras.calibration.timing.STEPS", 40)
     cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
     lines = commands(page)
     assert lines, f"{page} has no commands"

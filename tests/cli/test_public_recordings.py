@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 
 PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
 FRAMES = 3

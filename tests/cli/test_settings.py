@@ -14,8 +14,8 @@ from morgs_mi import cli
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.core.config import apply_values, config_toml
+from morgs_mi.extras.live.live_config import LIVE_STREAM
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.studio.live.live_config import LIVE_STREAM
 
 
 def printed_config(run, *args: object) -> StreamConfig:

@@ -147,7 +147,7 @@ def interrupted(name, *args, **more):
     return load(name, *args, **more)
 
 builtins.__import__ = interrupted
-from morgs_mi.cli import main
+from morgs_mi.cli.main import main
 sys.exit(main())
 """
 

@@ -12,8 +12,8 @@ import pytest
 
 from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.core.memory import check_memory, from_numpy, owned_copy, process_memory
-from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
 from tests.quick import quick
 from tests.scenes.changing_splats import rig, splats
 

@@ -20,10 +20,10 @@ from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.metrics import psnr, psnr_mu
 from morgs_mi.evaluate.tables import evaluation_summary
+from morgs_mi.extras.networks.lpips import Lpips
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.studio.networks.lpips import Lpips
 from tests.scenes.moving_splats import (
     CAMERAS,
     EXACT,

@@ -10,9 +10,9 @@ from io import BytesIO
 
 import pytest
 
+from morgs_mi.extras.imports.import_frames import import_frames
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.studio.import_frames import import_frames
 
 SPZ = gzip.compress(b"NGSP" + bytes(100))
 

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.extras.live.sources import ClipClock, play
 from morgs_mi.io.frame_times import true_rate
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.studio.live.sources import ClipClock, play
 from tests.scenes.captures import write_timed_video
 from tests.scenes.edit_lists import show_parts
 

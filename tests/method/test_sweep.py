@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.extras.calibration.offset_equations import image_gradient
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import MAPS, KeyImages
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.view_group import backproject
-from morgs_mi.studio.calibration.offset_equations import image_gradient
 from tests.assertions import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet

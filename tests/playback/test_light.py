@@ -15,11 +15,11 @@ from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
+from morgs_mi.extras.light.insert import InsertConfig, render_inserted
 from morgs_mi.io.exr import read_light
 from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.player import render_stream
 from morgs_mi.playback.stream_header import stream_exposure
-from morgs_mi.studio.light.insert import InsertConfig, render_inserted
 from tests.scenes.surfaces import camera, cloud
 
 STOPS = -2.5

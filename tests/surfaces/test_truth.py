@@ -13,9 +13,9 @@ import pytest
 from morgs_mi import FitConfig, StreamConfig, SynthConfig, open_stream, stream_capture, synthesize
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.studio.light.insert import InsertConfig, render_inserted
-from morgs_mi.studio.synth.path_tracer import PathTracer
-from morgs_mi.studio.synth.scene import Object, load_scene
+from morgs_mi.extras.light.insert import InsertConfig, render_inserted
+from morgs_mi.extras.synth.path_tracer import PathTracer
+from morgs_mi.extras.synth.scene import Object, load_scene
 
 BALL = {
     "type": "sphere",

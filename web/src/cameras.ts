@@ -54,7 +54,7 @@ export function turntableUp(camera: CameraFields, cameras: CameraFields[]): THRE
   return up.dot(own) < 0.1 ? own : up;
 }
 
-/** Rotation from world to y up, as `gltf_axes` in morgs_mi/studio/exports/axes.py. */
+/** Rotation from world to y up, as `gltf_axes` in morgs_mi/extras/exports/axes.py. */
 export function upright(cameras: CameraFields[]): THREE.Quaternion {
   const y = upDirection(cameras);
   const [right, ahead] = [0, 2].map((i) => axisOf(cameras[0], i).projectOnPlane(y));

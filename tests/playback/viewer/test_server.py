@@ -26,6 +26,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.extras.live.fit_live import write_images
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.player import channel_image, picture
 from morgs_mi.playback.streams import open_stream
@@ -35,7 +36,6 @@ from morgs_mi.playback.viewer.access import refusal
 from morgs_mi.playback.viewer.images import RecordedImages
 from morgs_mi.playback.viewer.server import Viewer
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.studio.live.fit_live import write_images
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.playback.viewer.serving import decoded, exact, get, raw, viewing
 from tests.scenes import noise_capture
@@ -540,7 +540,7 @@ def test_view__refuses_a_port_that_is_taken(clip, capsys):
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_view__ends_on_ctrl_c(clip):
-    code = "import sys; from morgs_mi.cli import main; sys.exit(main())"
+    code = "import sys; from morgs_mi.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "view", str(clip[0]), "--no-browser"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

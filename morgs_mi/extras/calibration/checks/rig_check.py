@@ -1,0 +1,297 @@
+"""Check of the camera poses against feature matches that are found without the poses.
+
+A camera fits if most of its matches with other fitting cameras have a small reprojection error. If
+a pose does not fit, the common mistakes of `mistakes` are tried. The check reports the mistake that
+explains the matches. Pixels refer to the recorded size, as in `capture.points`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.features import Match, detect, match_views, reprojection_errors
+from morgs_mi.capture.points import MAX_ERROR, SharedFeatures
+from morgs_mi.core.camera import Camera
+from morgs_mi.extras.calibration.checks.mistakes import (
+    camera_candidates,
+    duplicate_poses,
+    focal_candidates,
+    rig_candidates,
+    with_focal_factor,
+)
+from morgs_mi.fit.view import View
+
+# With a wrong pose a few matches may fit by chance, but not this many.
+_MIN_MATCHES = 50
+# px. Features of two cameras at different places are farther apart.
+_SAME_IMAGE = 0.5
+# A correction must lower the error by this factor, and to less than twice the error of the poses
+# that fit or to this many pixels: among many candidates, a wrong one may be slightly better than
+# the given poses.
+_GAIN = 3.0
+_GOOD_ERROR = 0.5
+# Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not
+# more accurate.
+_SAMPLE = 40
+_FACTOR_PAIRS = 8
+# px. Width at which the first frame of a fit is checked, in about a second for 20 views.
+_WIDTH = 480
+_NO_OVERLAP = (
+    "check that the clip is of this scene and not mirrored, compare the camera's place in the "
+    "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
+)
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """Result of checking the pose of one camera."""
+
+    name: str  #: Name of the camera.
+    matches: int  #: Number of its matches with other cameras.
+    #: Median reprojection error of its matches with the cameras that fit, or of all its matches if
+    #: there are none, px. NaN without matches, infinite if most of the points lie behind a camera.
+    error: float
+    fits: bool | None  #: Whether the pose fits the images; None if that could not be checked.
+    advice: str = ""  #: The reason and a remedy; empty if the pose fits.
+
+    @property
+    def verdict(self) -> str:
+        """The result in words."""
+        return "not checked" if self.fits is None else "fits" if self.fits else "does not fit"
+
+
+@dataclass(frozen=True)
+class RigCheck:
+    """Result of checking the poses on the first frame."""
+
+    matches: int  #: Number of matches, over all pairs of views.
+    pairs: int  #: Number of pairs of views with matches.
+    error: float  #: Median reprojection error, px; NaN without matches.
+    cameras: tuple[CameraCheck, ...]  #: Result of each camera.
+    #: Whether all poses fit the images; None if no pose is known to be wrong but some could not be
+    #: checked.
+    fits: bool | None
+    advice: str  #: One sentence with the result, and the remedy if it is the same for all cameras.
+
+
+def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
+    """Return the result of checking the capture's cameras against the matches between its views."""
+    capture = capture.at_recorded_size()
+    pairs = _Pairs.of(shared, capture.cameras)
+    group = pairs.agreeing()
+    checks = [_check(view, pairs, group) for view in range(len(capture.cameras))]
+    errors = np.concatenate([np.zeros(0), *pairs.errors])
+    correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
+    if correction:
+        cameras, explanation = correction
+        # The views with another corrected camera are wrong.
+        views = range(len(cameras))
+        culprits = {view for view in views if cameras[view] is not pairs.cameras[view]}
+        checks = [_check(view, pairs, set(views) - culprits) for view in views]
+        for view in culprits:
+            if checks[view].matches:
+                checks[view] = replace(checks[view], fits=False, advice="")
+        advice = f"the poses do not fit the images: {explanation}."
+    else:
+        checks = _with_copies(checks, pairs)
+        for view, check in enumerate(checks):
+            if check.fits is False and not check.advice:
+                reason = _explain_camera(view, check, pairs.sampled(), group)
+                checks[view] = replace(check, advice=reason)
+        wrong = ", ".join(c.name for c in checks if c.fits is False)
+        not_checked = ", ".join(c.name for c in checks if c.fits is None)
+        count = sum(c.fits is True for c in checks)
+        rest = f"; not checked: {not_checked}" if not_checked else ""
+        if wrong:
+            advice = f"the poses of {wrong} do not fit the images{rest}."
+        elif not count:
+            advice = (
+                "too few matches to check the poses: the views have little overlap, or the scene "
+                "has little texture."
+            )
+        else:
+            some = f" of {count} of {len(checks)} cameras" if not_checked else ""
+            advice = f"the poses{some} fit the images{rest}."
+    verdicts = [check.fits for check in checks]
+    fits = False if False in verdicts else None if None in verdicts else True
+    return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
+
+
+def pose_problems(views: Sequence[View]) -> list[str]:
+    """Return a sentence if poses are known not to fit the images of views, otherwise none."""
+    cameras = []
+    features = []
+    for index, view in enumerate(views):
+        # Large errors, such as another order of the cameras, show in small images.
+        camera = view.camera.with_width(min(_WIDTH, view.camera.width))
+        size = (camera.width, camera.height)
+        image = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+        features.append(detect(image, view.mask))
+        cameras.append(replace(camera, name=camera.name or f"view {index}"))
+    none = np.zeros((0, 3))
+    capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
+    matches = match_views(features, cameras)
+    check = check_rig(capture, SharedFeatures(tuple(features), tuple(matches)))
+    return [check.advice] if check.fits is False else []
+
+
+def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
+    """Return the results with the reasons for cameras with the pose or the clip of another one."""
+    reasons: dict[int, str] = {}
+    for pair in duplicate_poses(pairs.cameras):
+        # If one of the two fits, the pose is its own.
+        for view in [view for view in pair if not checks[view].fits] or pair:
+            reasons.setdefault(
+                view,
+                f"it has the same pose as {checks[sum(pair) - view].name}: give each camera its "
+                "own, or leave the copy out (--without)",
+            )
+    results = list(checks)
+    for view, advice in reasons.items():
+        results[view] = replace(results[view], fits=False, advice=advice)
+    for match in pairs.shared.matches:
+        a, b = match.pixels(pairs.shared.features)
+        if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
+            for view in match.views:
+                if view in reasons or not checks[view].fits:
+                    other = checks[sum(match.views) - view].name
+                    advice = f"its clip is a copy of the clip of {other}; replace one of them"
+                    results[view] = replace(results[view], fits=False, advice=advice)
+    return results
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Reprojection errors of all pairs of views with matches."""
+
+    shared: SharedFeatures  # the matches
+    cameras: tuple[Camera, ...]  # the poses
+    errors: tuple[np.ndarray, ...]  # per match of a pair [M], px
+
+    @classmethod
+    def of(cls, shared: SharedFeatures, cameras: Sequence[Camera]) -> _Pairs:
+        errors = (reprojection_errors(match, shared.features, cameras) for match in shared.matches)
+        return cls(shared, tuple(cameras), tuple(errors))
+
+    def of_view(self, view: int, partners: Collection[int] | None = None) -> np.ndarray:
+        """Return the errors of a view's matches with `partners`, by default with all views, px."""
+        pairs = zip(self.shared.matches, self.errors, strict=True)
+        parts = [errors for match, errors in pairs if _is_shared(match, view, partners)]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
+        """Return the median error of a view's matches with `partners` for another camera, px."""
+        matches = tuple(m for m in self.shared.matches if _is_shared(m, view, partners))
+        cameras = [camera if i == view else c for i, c in enumerate(self.cameras)]
+        return _median(_Pairs.of(replace(self.shared, matches=matches), cameras).of_view(view))
+
+    def sampled(self, max_pairs: int | None = None) -> _Pairs:
+        """Return the errors of a part of each pair's matches, for the `max_pairs` pairs with the
+        most matches.
+        """
+        largest = sorted(self.shared.matches, key=lambda match: -len(match.features))[:max_pairs]
+        few = (replace(m, features=m.features[:: -(-len(m.features) // _SAMPLE)]) for m in largest)
+        return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
+
+    def worst(self) -> float:
+        """Return the largest median error of a view, px; there must be matches."""
+        return float(np.nanmax([_median(self.of_view(view)) for view in range(len(self.cameras))]))
+
+    def agreeing(self) -> set[int]:
+        """Return the views with mostly small errors in the matches between them.
+
+        The view with the largest share of large errors is removed until no share exceeds a half,
+        because a wrong pose spoils the matches of the other views too.
+        """
+        group = {view for match in self.shared.matches for view in match.views}
+        while group:
+            errors = {view: self.of_view(view, group) for view in sorted(group)}
+            shares = {v: np.mean(e > MAX_ERROR) if len(e) else 1.0 for v, e in errors.items()}
+            worst = max(shares, key=lambda view: shares[view])
+            if shares[worst] <= 0.5:
+                break
+            group = group - {worst}
+        return group
+
+
+def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
+    """Return whether a match is between a view and one of its `partners`, which are all views if
+    None.
+    """
+    return view in match.views and (
+        partners is None or (set(match.views) - {view}) <= set(partners)
+    )
+
+
+def _median(errors: np.ndarray) -> float:
+    return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
+    """Return the result of a view; its advice is empty if the pose does not fit."""
+    all_errors = errors = pairs.of_view(view)
+    advice = ""
+    if len(in_group := pairs.of_view(view, group)):
+        errors = in_group
+    elif group:
+        advice = "matches only with cameras that do not fit: correct those first"
+    if not len(errors):
+        advice = f"no matches with any other camera: {_NO_OVERLAP}"
+    elif not advice and len(errors) < _MIN_MATCHES:
+        advice = f"only {len(errors)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    error = _median(errors)
+    fits = None if advice else error <= MAX_ERROR
+    return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)
+
+
+def _correct_rig(
+    capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]
+) -> tuple[Sequence[Camera], str] | None:
+    """Return the cameras corrected for a mistake in several poses, and its description; None if
+    none explains all.
+    """
+    error = pairs.worst()
+    # The pairs with the most matches determine a factor on all focal lengths.
+    largest = pairs.sampled(_FACTOR_PAIRS).shared
+    candidates = focal_candidates(
+        "the focal lengths of all cameras seem",
+        lambda factor: [with_focal_factor(camera, factor) for camera in pairs.cameras],
+        lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
+    )
+    if error > _GOOD_ERROR:
+        wrong = [view for view, check in enumerate(checks) if check.fits is False]
+        candidates = [*rig_candidates(capture, wrong), *candidates]
+    errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
+    if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
+        return candidates[int(np.argmin(errors))]
+
+
+def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
+    """Return the common mistake that explains the matches of a view, and a remedy."""
+    # Without views that agree, a correction can only be compared with all others.
+    partners = group or set(range(len(pairs.cameras)))
+    error_of = partial(pairs.of_replaced, view, partners=partners)
+    camera = pairs.cameras[view]
+    factors = focal_candidates(
+        "its focal length seems", lambda factor: with_focal_factor(camera, factor), error_of
+    )
+    candidates = [*camera_candidates(camera), *factors]
+    best, sentence = min(candidates, key=lambda candidate: error_of(candidate[0]))
+    of_group = [_median(pairs.of_view(view, group)) for view in group]
+    good = max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
+    if error_of(best) <= min(check.error / _GAIN, MAX_ERROR, good):
+        return sentence
+    cause = "no common mistake explains it"
+    if np.isinf(check.error):
+        cause = "the points in its images lie behind it, so it looks away from them"
+    return (
+        f"{cause}: check its place in the order of the cameras, its axes and the image size of "
+        "the calibration, or calibrate again (morgs-mi calibrate)"
+    )

@@ -1,0 +1,213 @@
+"""`morgs-mi info` and `calibrate`: the contents of a capture, and camera poses from its images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional, arg
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.capture.points import match_capture, triangulate_points
+from morgs_mi.cli.console import print_result, print_table, print_warning, progress
+from morgs_mi.cli.settings import Flag, GivenReading, Reading, Without, optional
+from morgs_mi.core.plots import check_plot
+from morgs_mi.extras.calibration.calibrate import CalibrateConfig
+from morgs_mi.extras.calibration.checks.plots import write_rig
+from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
+from morgs_mi.extras.calibration.timing import TimeOffsets, estimate_time_offsets
+from morgs_mi.fit.forecast import forecast
+
+# Columns of a camera, after its index and name.
+_COLUMNS = (
+    "size",
+    "focal, px",
+    "centre, px",
+    "seen",
+    "use",
+    "matches",
+    "error, px",
+    "pose",
+)
+# Standard errors in frames above which a time offset is uncertain, and from which it counts as not
+# found.
+_UNCERTAIN = 0.1
+_NOT_FOUND = 0.5
+_UNCERTAIN_WHY = (
+    "Their images hardly depend on the clocks: little moves, or in a direction in which an offset "
+    "looks like a change of depth, or the cameras are far apart."
+)
+
+
+@dataclass(frozen=True)
+class Info:
+    """List the contents of a capture: layout, cameras, sizes, frames, points; check its poses
+    against the images.
+    """
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
+    """File for a plot of the rig, .png, .jpg, .svg or .pdf."""
+    check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
+    """Check the poses against feature matches between the views of the first frame."""
+    time: Flag = False
+    """Estimate the time offsets of the cameras from what moves in the first frames."""
+    reading: GivenReading = field(default_factory=Reading)
+
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
+
+    def run(self) -> None:
+        if self.plot is not None:
+            check_output(self.plot)
+            check_plot(self.plot)
+        capture = load_capture(self.capture, reading=self.reading.read_config())
+        points = f"{len(capture.points)} points" if len(capture.points) else "without points"
+        rig_check = None
+        if self.check:
+            with progress() as report:
+                shared = match_capture(capture, partial(report, "Matching views"))
+            rig_check = check_rig(capture, shared)
+            if not len(capture.points):
+                capture = triangulate_points(capture, shared)
+                points += f" ({len(capture.points)} can be triangulated)"
+        train_cameras = [capture.cameras[v] for v in capture.train_views]
+        if len(train_cameras) > 1:
+            print_result(forecast(train_cameras, capture.points).sentence)
+        if rig_check is not None:
+            error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
+            print_result(
+                f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} "
+                f"pairs; {rig_check.advice}"
+            )
+            for line in _advice_lines(rig_check.cameras):
+                print_result(line)
+        truth = "with ground truth" if capture.truth else "without ground truth"
+        print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        for note in capture.notes:
+            print_result(note)
+        print_table(_camera_table(capture, rig_check))
+        if self.time:
+            with progress() as report:
+                offsets = estimate_time_offsets(capture, partial(report, "Comparing clocks"))
+            for line in _time_lines(offsets):
+                print_result(line)
+        if self.plot is not None:
+            write_rig(self.plot, capture)
+            print_result(f"Plot of the rig: {self.plot}")
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Calibrate the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
+
+    folder: Positional[Path]
+    """Folder of videos, or of one folder of images per camera."""
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(
+        default_factory=CalibrateConfig
+    )
+    without: Without = ()
+    """Cameras that are left out, by name."""
+    overwrite: Flag = False
+    """Replace an earlier model in FOLDER/sparse."""
+
+    def run(self) -> None:
+        from morgs_mi.extras.calibration.calibrate import calibrate
+
+        with progress() as report:
+            result = calibrate(
+                self.folder,
+                self.config,
+                self.overwrite,
+                lambda *stage: report(*stage),
+                self.without,
+            )
+        table = _check_table(str(result.model), ("camera", "points", "error, px", "pose"))
+        for check in result.checks:
+            table.add_row(check.name, *_check_cells(check))
+        print_table(table)
+        for line in _advice_lines(result.checks):
+            print_warning(line)
+        points = ", with a principal point for each" if result.principal_points else ""
+        print_result(
+            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
+            f"reprojection error {result.error:.2f} px, by {result.mapper} mapping{points}; scale "
+            "and up direction of its world are arbitrary."
+        )
+
+
+def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
+    """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
+    table = _check_table(f"{capture.path}: {capture.layout}", ("", "camera", *_COLUMNS))
+    for index, camera in enumerate(capture.cameras):
+        K = camera.K
+        fx = f"{K[0, 0]:.1f}"
+        fy = f"{K[1, 1]:.1f}"
+        mask = capture.masks[index]
+        table.add_row(
+            str(index),
+            camera.name,
+            f"{camera.width}x{camera.height}",
+            fx if fx == fy else f"{fx} {fy}",
+            f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
+            "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
+            "test" if index in capture.test_views else "train",
+            *_check_cells(rig_check.cameras[index] if rig_check else None),
+        )
+    return table
+
+
+def _time_lines(offsets: TimeOffsets) -> list[str]:
+    """Return the time offsets as the options that align the clips, and how certain they are."""
+    errors = {name: error for name, error in offsets.errors.items() if name != offsets.reference}
+    measured_errors = {name: error for name, error in errors.items() if error < _NOT_FOUND}
+    lines = []
+    if measured_errors:
+        options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in measured_errors)
+        worst = max(measured_errors, key=lambda name: measured_errors[name])
+        lines = [
+            f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
+            f"Standard errors of these offsets: up to {errors[worst]:.2f} frames ({worst}).",
+        ]
+    doubts = [f"{name} ({e:.2f})" for name, e in measured_errors.items() if e > _UNCERTAIN]
+    if doubts:
+        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
+    if len(measured_errors) < len(errors):
+        names = ", ".join(name for name in errors if name not in measured_errors)
+        lines.append(f"Clocks not found: {names}; keep what is known of them. {_UNCERTAIN_WHY}")
+    if not offsets.converged:
+        lines.append(
+            f"The offsets still change by {offsets.change:.2f} frames: the clips may not show "
+            "enough."
+        )
+    return lines
+
+
+def _check_table(title: str, columns: Sequence[str]) -> Table:
+    """Return a table without rows, whose cells are not wrapped."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in columns:
+        table.add_column(column, no_wrap=True)
+    return table
+
+
+def _check_cells(check: CameraCheck | None) -> tuple[str, str, str]:
+    """Return the number of matches, the error and the verdict of a camera as text."""
+    if check is None:
+        return "-", "-", "not checked"
+    return str(check.matches), f"{check.error:.2f}" if check.matches else "-", check.verdict
+
+
+def _advice_lines(checks: Sequence[CameraCheck]) -> list[str]:
+    """Return a sentence per advice, with the names of the cameras that it concerns."""
+    names: dict[str, list[str]] = {}
+    for check in checks:
+        if check.advice:
+            names.setdefault(f"{check.verdict}: {check.advice}.", []).append(check.name)
+    return [f"{', '.join(cameras)} {text}" for text, cameras in names.items()]

@@ -1,0 +1,477 @@
+"""Refinement of calibrated cameras on the first frame: poses, focal lengths, principal points and
+radial distortion.
+
+Beyond the paper. With enough feature matches, bundle adjustment gives a first estimate (see
+`bundle`). Rounds then lower the difference between images and renderings. A round is a short fit of
+Gaussians, followed by Gauss-Newton steps for all cameras and the means of all Gaussians at once.
+With the blend weights w fixed, the error e = target - image of a view is linear in the shift u of a
+splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g, it becomes e + g .
+u. A Gaussian is therefore an observation of `NormalEquations` in each view, with
+
+    G = sum_x w g g' / v,    b = sum_x w e g / v,
+
+where the variance v is the mean square error times the number of pixels with similar errors.
+
+Refined cameras are evaluated on withheld pixels: blocks of every training view that no fit uses.
+Three fits from the same start are compared by the PSNR of these pixels: with the calibrated
+cameras, with the cameras of the bundle adjustment, and with the cameras after the rounds. If there
+are many sharp features, the rounds only lose accuracy.
+
+Each round removes the distortion estimated so far from the images, because Gaussians are rendered
+with pinhole cameras.
+
+Cameras stay in the calibration's frame of reference and keep their mean focal length (see
+`bundle`). A camera that is not refined therefore fits as before. Points move with the cameras to
+keep their projections. The held-out view keeps its calibrated camera; `register_camera` fits a
+camera to its image while the Gaussians are frozen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.features import detect, intersect, join_matches, match_views
+from morgs_mi.capture.lens import Lens, undistortion
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Steps
+from morgs_mi.core.random_streams import Stream, rng_of
+from morgs_mi.core.rig import scene_extent, seen_points
+from morgs_mi.extras.calibration.bundle import (
+    CHANGES,
+    NormalEquations,
+    bundle_adjust,
+    camera_jacobian,
+    changed_camera,
+    distorted,
+    likely_deviations,
+    prior_deviations,
+    undistorted,
+)
+from morgs_mi.extras.calibration.offset_equations import (
+    blurred,
+    gradient_products,
+    image_gradient,
+)
+from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.render_config import RenderConfig
+
+# A camera with features in fewer tracks is not determined by them.
+_MIN_TRACKS = 40
+# Number of pixels with similar errors, because the fit lacks a detail there. They count as one
+# pixel: otherwise priors would have no influence, and cameras would follow the errors of a short
+# fit.
+_ALIKE = 10.0
+# Gauss-Newton steps of a round, their damping, and the longest step of a mean in scene extents.
+_STEPS = 3
+_DAMPING = 1e-3
+_LONGEST = 0.02
+# px, standard deviations of the blur of images and gradients in the first rounds, for errors of
+# several pixels.
+_BLURS = (2.0, 1.0)
+# Error at which a pixel has half its weight, relative to white: larger errors are details that the
+# fit lacks.
+_HALF_WEIGHT = 0.1
+# Least mean square error: a rendering compared with itself has an error of 0.
+_LEAST_ERROR = 1e-10
+# Deviation of a fixed distortion; least valid share of a resampled pixel.
+_NO_DISTORTION = 1e-4
+_VALID = 0.999
+# Steps of the registration of a camera, which end when they change its pixels by less than this,
+# px.
+_REGISTRATION_STEPS = 30
+_LEAST_SHIFT = 1e-3
+# Factors on the learning rates in the rounds after the first.
+_LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Result of refining cameras."""
+
+    taken: bool  #: Whether the refined cameras are used.
+    #: PSNR of withheld pixels in a fit with the calibrated cameras, dB; NaN without a comparison.
+    calibrated_psnr: float
+    refined_psnr: float  #: PSNR of the same pixels in a fit with the refined cameras, dB.
+    tracks: int  #: Number of points in the bundle adjustment; 0 if there were too few.
+    rotation: float  #: Largest change of a rotation, degrees.
+    position: float  #: Largest change of a position, world units.
+    focal: float  #: Largest relative change of a focal length.
+    #: Largest shift of a pixel by the remaining distortion, in image widths.
+    distortion: float = 0.0
+
+    @property
+    def sentence(self) -> str:
+        """The change of the cameras and its reason, in a sentence."""
+        scores = (
+            f"withheld pixels have {self.refined_psnr:.2f} dB instead of "
+            f"{self.calibrated_psnr:.2f} dB"
+        )
+        if not self.taken:
+            return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
+        sizes = (
+            f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, "
+            f"{100 * self.focal:.2g} % of the focal length and {100 * self.distortion:.2g} % of "
+            "the image's width by the lens"
+        )
+        reason = "" if np.isnan(self.calibrated_psnr) else f": {scores}"
+        return f"The cameras were refined, {sizes}{reason}."
+
+    def validation(
+        self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
+    ) -> dict[str, Any]:
+        """Return the result with its sentence, and the PSNR of the held-out views, if there are
+        any.
+
+        The PSNR is the mean over these views, in dB: once with the calibrated cameras, once with
+        registered ones.
+
+        Args:
+            capture: with the refined cameras.
+            gaussians: of the first frame.
+            frame: its images.
+            config: settings of the fit.
+        """
+        result = {**asdict(self), "sentence": self.sentence}
+        views = [view for v in capture.test_views if (view := _view(capture, frame.images, v))]
+        if not views:
+            return result
+        extent = scene_extent([capture.cameras[v] for v in capture.train_views])
+        registered = [
+            view._replace(
+                camera=register_camera(gaussians, view, extent, config.fit, config.render)
+            )
+            for view in views
+        ]
+        rigs = {"calibrated_psnr": views, "registered_psnr": registered}
+        scores = {name: mean_psnr(gaussians, rig, config.render) for name, rig in rigs.items()}
+        return result | {"held_out": scores}
+
+
+def _view(capture: Capture, images: Sequence[np.ndarray | None], view: int) -> View | None:
+    """Return a view of a capture with its image, or None without an image."""
+    if (image := images[view]) is not None:
+        return View(capture.cameras[view], image, capture.masks[view])
+
+
+def refine_cameras(
+    capture: Capture,
+    config: FitConfig,
+    render: RenderConfig | None = None,
+    seed: int = 0,
+    progress: Steps | None = None,
+) -> tuple[Capture, Refinement]:
+    """Return the capture with refined training cameras and moved points, if these are better, and
+    the result.
+
+    Args:
+        capture: its first frame and its points are used, without the held-out view.
+        config: settings of the fit; `refine_cameras` "on" always selects the refined cameras.
+        render: cut-offs.
+        seed: seed of all random choices.
+        progress: called with (fits done, fits in all).
+
+    Raises:
+        ValueError: fewer than two training views have an image of the first frame.
+    """
+    problem = _Problem.of(capture, config, render or RenderConfig(), seed)
+    deviations = prior_deviations(problem.extent, config.camera_priors)
+    bundle_changes, tracks, deviations = _matched(capture, problem.indices, deviations)
+    has_rival = config.refine_cameras == "auto"
+    # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
+    # compared.
+    estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
+    fits = config.short_fits.rounds + len(estimates) + bool(estimates)
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done, fits)
+
+    estimates.append(problem.refined(bundle_changes, deviations, report))
+    scores = problem.scores(estimates, report) if len(estimates) > 1 else [float("nan")]
+    # The best estimate, apart from the calibrated cameras.
+    best = has_rival + int(np.argmax(scores[has_rival:]))
+    calibrated = scores[0] if has_rival else float("nan")
+    is_better = not scores[best] < calibrated + LEAST_GAIN
+    changes = estimates[best]
+    refinement = Refinement(
+        is_better, calibrated, scores[best], tracks, *_sizes(problem.cameras, changes)
+    )
+    return problem.changed_capture(changes) if is_better else capture, refinement
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Cameras to refine, and the images that evaluate them."""
+
+    capture: Capture  # capture with the calibrated cameras
+    indices: tuple[int, ...]  # indices of the V training views with an image
+    views: tuple[View, ...]  # these views, reduced, without the withheld blocks
+    unseen: tuple[View, ...]  # their withheld blocks
+    extent: float  # scene extent, world units
+    config: FitConfig  # settings of the fit
+    render: RenderConfig  # cut-offs
+    seed: int  # seed of all random choices
+
+    @classmethod
+    def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
+        """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
+        images = next(capture.displayed().partial_frames(0, 1)).images
+        train = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
+        requirement = "expected images of at least two training views"
+        remedy = "record more, or set `refine_cameras` to off"
+        require(len(train) > 1, "refine_cameras()", requirement, len(train), remedy)
+        rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
+        views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
+        extent = scene_extent([view.camera for view in train.values()])
+        return cls(
+            capture, tuple(train), tuple(views), tuple(withheld_views), extent, config, render, seed
+        )
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The calibrated cameras at the size of the capture."""
+        return [self.capture.cameras[v] for v in self.indices]
+
+    def refined(
+        self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]
+    ) -> np.ndarray:
+        """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint
+        steps.
+
+        Args:
+            changes: initial changes [V, 11].
+            deviations: standard deviations of the priors [11].
+            report: called with the number of completed fits.
+        """
+        problem = self._begun(changes)
+        for done in range(self.config.short_fits.rounds):
+            report(done)
+            problem = replace(problem, views=tuple(_changed(self.views, changes)))
+            gaussians = self._fitted(problem, is_later=done > 0)
+            blur = _BLURS[done] if done < len(_BLURS) else 0.0
+            for _ in range(_STEPS):
+                gaussians, changes = _joint_step(
+                    gaussians, self.views, changes, deviations, blur, self.render
+                )
+            problem = replace(problem, start=gaussians)
+        return changes
+
+    def scores(self, estimates: Sequence[np.ndarray], report: Callable[[int], None]) -> list[float]:
+        """Return the PSNR of the withheld pixels, dB, after fits with cameras by each of several
+        changes; `report` is called with the number of completed fits.
+        """
+        scores = []
+        for done, changes in enumerate(estimates, self.config.short_fits.rounds):
+            report(done)
+            views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
+            scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
+        return scores
+
+    def changed_capture(self, changes: np.ndarray) -> Capture:
+        """Return the capture with changed cameras and moved points."""
+        cameras = list(self.capture.cameras)
+        distortions = np.zeros((len(cameras), 2))
+        for v, change in zip(self.indices, changes, strict=True):
+            cameras[v] = changed_camera(cameras[v], change)
+            distortions[v] = change[9:]
+        rig = self.capture.with_cameras(cameras, distortions.tolist())
+        return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
+
+    def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
+        """Return the problem of a short fit with changed cameras."""
+        points = _moved(self.capture.points, self.cameras, changes)
+        return FirstFrameProblem.of(
+            _changed(self.views, changes),
+            (points, self.capture.point_colors),
+            _short(self.config),
+            self.render,
+            rng_of(self.seed, Stream.REFINED_POINTS),
+        )
+
+    def _fitted(self, problem: FirstFrameProblem, is_later: bool = False) -> Gaussians:
+        return fit_first_frame(
+            problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)
+        ).gaussians
+
+
+def register_camera(
+    gaussians: Gaussians,
+    view: View,
+    extent: float,
+    config: FitConfig,
+    render: RenderConfig,
+) -> Camera:
+    """Return the camera, near the given one, with which frozen Gaussians fit an image best.
+
+    Args:
+        gaussians: frozen.
+        view: the calibrated camera and its image.
+        extent: scene extent, world units.
+        config: settings with the priors of the changes.
+        render: cut-offs.
+    """
+    priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
+    deviations = prior_deviations(extent, priors)
+    target = Target(view.image, view.mask)
+    means = np.asarray(gaussians.means, np.float64)
+    best = np.zeros((1, CHANGES))
+    for blur in (*_BLURS, 0.0):
+        changes = best
+        error = np.inf
+        for _ in range(_REGISTRATION_STEPS):
+            camera = changed_camera(view.camera, changes[0])
+            G, b, new_error = _shifts(gaussians, camera, target, blur, render)
+            if not new_error < error:
+                break
+            best = changes
+            error = new_error
+            of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
+            equations = NormalEquations(1, 0)
+            equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
+            step, _ = equations.step(changes, deviations, 0.0, np.zeros((0, CHANGES)))
+            changes = changes + step
+            if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
+                break
+    return changed_camera(view.camera, best[0])
+
+
+def _matched(
+    capture: Capture, train: Sequence[int], deviations: np.ndarray
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """Return the changes [V, 11] by bundle adjustment, the number of its points, and the likely
+    deviations [11].
+
+    Without enough points, there are no changes, and the deviations equal the priors' deviations.
+    """
+    recording = capture.displayed().at_recorded_size()
+    cameras = [recording.cameras[v] for v in train]
+    images = next(recording.partial_frames(0, 1)).images
+    features = [detect(images[v], recording.masks[v]) for v in train]
+    tracks = join_matches(match_views(features, cameras), features)
+    if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
+        return np.zeros((len(train), CHANGES)), 0, deviations
+    deviations = likely_deviations(cameras, tracks, deviations)
+    return bundle_adjust(cameras, tracks, deviations)[0], tracks.count, deviations
+
+
+def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
+    """Return views with changed cameras, and images and masks without the cameras' distortion."""
+    changed_views = []
+    for (camera, image, mask), change in zip(views, changes, strict=True):
+        camera = changed_camera(camera, change)
+        correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
+        if correction is not None:
+            valid = correction.mask
+            if mask is not None:
+                valid = valid & (correction(mask.astype(np.float32)) > _VALID)
+            image = correction(image)
+            mask = valid
+        changed_views.append(View(camera, image, mask))
+    return changed_views
+
+
+def _sizes(cameras: Sequence[Camera], changes: np.ndarray) -> list[float]:
+    """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by
+    the lens.
+    """
+    shifts = []
+    for camera, change in zip(cameras, changes, strict=True):
+        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * (camera.width, camera.height)
+        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
+    vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
+    return [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
+
+
+def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
+    """Return points [P, 3] moved to keep their projections in the views that show them, with
+    changed cameras.
+    """
+    rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
+    masks, pixels, _ = zip(*(seen_points(camera, points) for camera in cameras), strict=True)
+    pixels = map(undistorted, rig, pixels, changes[:, 9:])
+    counts = np.sum(masks, axis=0)
+    views, ids = np.nonzero(masks)
+    intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
+    is_determined = (counts >= 2) & np.isfinite(intersections).all(axis=1)
+    return np.where(is_determined[:, None], intersections, points).astype(np.float32)
+
+
+def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
+    """Return the settings of a short fit; a later one continues with half the steps and lower
+    rates.
+
+    It has no view-dependent colours, which would hide wrong poses.
+    """
+    how = config.short_fits
+    rates = config.first_frame_rates
+    if is_later:
+        factors = _LATER_RATES.items()
+        rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in factors})
+    return replace(
+        config,
+        sh_degree=0,
+        num_gaussians=how.gaussians,
+        first_frame_steps=how.steps // 2 if is_later else how.steps,
+        first_frame_rates=rates,
+        dropout=0.0,
+        density=replace(config.density, rounds=0),
+    )
+
+
+def _joint_step(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    changes: np.ndarray,
+    deviations: np.ndarray,
+    blur: float,
+    render: RenderConfig,
+) -> tuple[Gaussians, np.ndarray]:
+    """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of
+    both.
+    """
+    means = np.asarray(gaussians.means, np.float64)
+    changed_views = _changed(views, changes)
+    shifts = [
+        _shifts(gaussians, view.camera, Target(view.image, view.mask), blur, render)
+        for view in changed_views
+    ]
+    variance = _ALIKE * np.mean([error for *_, error in shifts])
+    equations = NormalEquations(len(views), len(means))
+    for v, (view, (G, b, _)) in enumerate(zip(changed_views, shifts, strict=True)):
+        jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
+        equations.add(v, slice(None), jacobian, G / variance, b / variance)
+    of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
+    longest = _LONGEST * scene_extent([view.camera for view in views])
+    lengths = np.linalg.norm(of_means, axis=1, keepdims=True)
+    means = means + of_means * np.minimum(1, longest / np.maximum(lengths, 1e-30))
+    return replace(gaussians, means=means.astype(np.float32)), changes + of_changes
+
+
+def _shifts(
+    gaussians: Gaussians, camera: Camera, target: Target, blur: float, render: RenderConfig
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return G v [N, 2, 2] and b v [N, 2] of the module docstring in a view, and the mean square
+    error.
+    """
+    view = ActiveView(camera, render)
+    image = view.render(gaussians).color
+    error = target.difference(image)
+    square = max(float(np.mean(error**2)), _LEAST_ERROR)
+    # The mean of the rendering and the target, or the rendering where the target is masked.
+    gradient = image_gradient(blurred((np.asarray(image) + 0.5 * error).astype(np.float32), blur))
+    error = blurred(error, blur)
+    weight = 1 / (1 + np.sum(error**2, axis=-1) / _HALF_WEIGHT**2)
+    return *gradient_products(gaussians, view, error, gradient, weight), square

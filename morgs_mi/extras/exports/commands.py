@@ -1,0 +1,65 @@
+"""`morgs-mi export gltf` and `usd`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import DisallowNone, Positional
+
+from morgs_mi.cli.console import quantity
+from morgs_mi.cli.settings import Flag, place
+from morgs_mi.cli.streams import FRAMES, ExportKind, relative_to
+from morgs_mi.core.progress import Report
+from morgs_mi.playback.export.formats import GLTF, USD, Format
+
+if TYPE_CHECKING:
+    from morgs_mi.codec.frame_source import FrameSource
+
+
+@dataclass(frozen=True)
+class Gltf(ExportKind):
+    """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
+
+    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
+    """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
+    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+
+    formats = GLTF
+
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.codec.frame_source import play
+        from morgs_mi.extras.exports.gltf_export import gltf_axes, write_gltf
+        from morgs_mi.playback.export.clips import select_frames, write_each
+
+        frames = select_frames(stream, self.frames)
+        write = partial(write_gltf, axes=gltf_axes(stream.cameras))
+        write_each(
+            play(stream), output, f".{chosen.name}", write, frames, partial(report, "Writing")
+        )
+        return quantity(len(frames), "glTF file") + relative_to(stream)
+
+
+@dataclass(frozen=True)
+class Usd(ExportKind):
+    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to
+    y up.
+    """
+
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
+    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
+    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+    half: Flag = False
+    """Half precision of all attributes but the positions."""
+
+    formats = USD
+
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.extras.exports.usd import write_usd
+        from morgs_mi.playback.export.clips import select_frames
+
+        frames = select_frames(stream, self.frames)
+        write_usd(stream, output, frames, self.half, partial(report, "Writing"))
+        return f"{len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB"

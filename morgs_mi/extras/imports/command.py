@@ -1,0 +1,73 @@
+"""`morgs-mi import`: frames of other tools as a stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import DisallowNone, Positional, arg
+
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.settings import setting
+from morgs_mi.cli.streams import DropInvalid
+from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.playback.default_rig import Axes
+
+_PATHS = (
+    "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the "
+    "order of the frames. Last, OUT: a folder for stream.morgs, or a new file whose name ends in "
+    ".morgs."
+)
+
+
+@dataclass(frozen=True)
+class Import:
+    """Write frames of other tools, one file of Gaussians each, as a stream."""
+
+    # One list, as for `cp`: the parser cannot split two of them where options follow.
+    paths: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(metavar="FRAMES [FRAMES ...] OUT", help=_PATHS, help_behavior_hint=""),
+    ] = ()
+    fps: float = 30.0
+    """Frames per second."""
+    axes: Annotated[Axes, arg(metavar="NAME")] = "y-down"
+    """Direction that is up in the files: y-down, y-up or z-up."""
+    quality: Annotated[float | None, DisallowNone, setting("quality")] = None
+    """Precision of the stream; 2 halves all errors."""
+    target_size: Annotated[int | None, DisallowNone, setting("target_size")] = None
+    """Most bytes of a frame that continues the one before; 0: no limit."""
+    keyframe_interval: Annotated[int, arg(metavar="INT")] = CodecConfig().keyframe_interval
+    """Frames between two keyframes; 0: only where they are needed."""
+    drop_invalid: DropInvalid = False
+
+    def run(self) -> None:
+        from morgs_mi.extras.imports.import_frames import import_frames
+
+        if len(self.paths) < 2:
+            raise ValueError(
+                "morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help."
+            )
+        *frames, out = self.paths
+        options = {
+            name: value
+            for name in ("quality", "target_size")
+            if (value := getattr(self, name)) is not None
+        }
+        with progress() as report:
+            result = import_frames(
+                frames,
+                check_output(out),
+                self.fps,
+                replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options),
+                self.axes,
+                lambda done, of: report("Importing", done, of),
+                most_invalid=1.0 if self.drop_invalid else 0.0,
+            )
+        sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
+        print_result(
+            f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
+            f"{result.num_bytes / 1e6:.2f} MB."
+        )

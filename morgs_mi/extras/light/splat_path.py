@@ -1,0 +1,228 @@
+"""The Mitsuba integrator `splat_path`: paths among surfaces, along which the Gaussians emit and
+absorb light.
+
+    "integrator": {"type": "gaussian_splat", "surfaces": {"type": "splat_path"}}
+
+The Gaussians on a segment of a path act as one layer. C and T are their blended colour and
+transmittance, and L is the radiance that arrives from behind:
+
+    (1 - T) dec(C / (1 - T)) + T L
+
+`dec` decodes colours to linear light. The layer is linear in L: estimates of L may be noisy, and
+lights shine through it by the factor T, from whichever side they are found. It is left out between
+the camera and the first surface: there, `gaussian_splat` blends the splats.
+
+Derivatives are computed by path replay (Vicini et al. 2021), with the layers as constants.
+
+Mitsuba has a base class for every variant, so this module is imported again after mi.set_variant().
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import drjit as dr
+import mitsuba as mi
+from annotated_types import Ge
+from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
+
+from morgs_mi.core.checks import require
+from morgs_mi.core.config import Count, check_value
+from morgs_mi.core.types import Bool, Float
+from morgs_mi.extras.light.light_probe import CLIPPED, radiance
+from morgs_mi.surfaces.splat_rays import SplatRays
+
+_PROPERTIES = {
+    "max_depth": Annotated[int, Ge(-1)],
+    "rr_depth": Count,
+    "clipped": Annotated[float, Ge(1)],
+}
+
+
+@dataclass
+class _Path:
+    """Paths after some segments, the state of the loop."""
+
+    ray: Any  # next segment
+    depth: Any  # number of segments that ended on a surface
+    L: Any  # radiance so far; in the second pass, what is left of it
+    δL: Any  # its derivative
+    β: Any  # throughput
+    η: Any  # ratio of the indices of refraction
+    si: Any  # surface that the next segment leaves
+    pdf: Any  # density of its direction there
+    is_delta: Any  # whether the direction had no choice
+
+
+class SplatPathIntegrator(RBIntegrator):
+    r"""Path tracer for surfaces among Gaussians (:monosp:`splat_path`), the `surfaces` of a
+    `gaussian_splat`.
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path, in segments; -1: any length. (Default: 6)
+
+     * - rr_depth
+       - |int|
+       - Segments after which Russian roulette may end a path. (Default: 5)
+
+     * - clipped
+       - |float|
+       - Radiance of colours that the video clipped at 1, as for `light_probe`. (Default: 4)
+
+     * - hide_emitters
+       - |bool|
+       - Whether the camera does not see the environment. (Default: False)
+
+    Differentiable in materials and lights. Positions of surfaces, and the Gaussians along paths,
+    get no gradient.
+    """
+
+    def __init__(self, props: Any) -> None:
+        for name, kind in _PROPERTIES.items():
+            if name in props:
+                check_value("splat_path", name, props[name], kind)
+        super().__init__(props)
+        require(
+            mi.is_rgb,
+            "splat_path",
+            "expected a variant such as 'llvm_ad_rgb'",
+            repr(mi.variant()),
+            "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours",
+        )
+        self.clipped = float(props.get("clipped", CLIPPED))
+        self.splats: SplatRays | None = None
+        self.srgb = True
+
+    def sample(
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any = None,
+        state_in: Any = None,
+        active: Bool = True,
+        **_: Any,
+    ) -> tuple[Any, Bool, list[Float], Any]:
+        """Return radiance or its derivative, as `ADIntegrator.sample` does."""
+        remedy = "set it as the `surfaces` of a `gaussian_splat`, which passes its own"
+        require(self.splats, "splat_path", "expected Gaussians", "none", remedy)
+        primal = mode == dr.ADMode.Primal
+        ctx = mi.BSDFContext()
+        sign = 1 if primal else -1
+
+        def bounce(active: Bool, sampler: Any, path: _Path) -> tuple[Bool, Any, _Path]:
+            ray = path.ray
+            depth = path.depth
+            L = path.L
+            δL = path.δL
+            β = path.β
+            si = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+            bsdf = si.bsdf(ray)
+
+            # --------------------- Gaussians on the segment ---------------------
+
+            ray.maxt = dr.select(si.is_valid(), si.t, dr.largest(mi.Float))
+            emission, transmittance = self._layer(ray, active & (depth > 0))
+            L += sign * β * emission
+            β *= transmittance
+
+            # ------------------------- Direct emission --------------------------
+
+            visible = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
+            ds = mi.DirectionSample3f(scene, si, path.si)
+            mis = mis_weight(path.pdf, scene.pdf_emitter_direction(path.si, ds, ~path.is_delta))
+            with dr.resume_grad(when=not primal):
+                Le = β * mis * ds.emitter.eval(si, visible)
+
+            # ------------------------- Emitter sampling -------------------------
+
+            proceed = active & (depth + 1 < self.max_depth) & si.is_valid()
+            with_light = proceed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            ds, weight = scene.sample_emitter_direction(
+                si, sampler.next_2d(with_light), True, with_light
+            )
+            with_light &= ds.pdf != 0
+            weight *= self._to_light(
+                si, ds, with_light & (dr.max(mi.unpolarized_spectrum(weight)) > 0)
+            )
+            wo = si.to_local(ds.d)
+            with dr.resume_grad(when=not primal):
+                if not primal:
+                    attached = scene.eval_emitter_direction(si, ds, with_light)
+                    weight = weight * dr.relative_grad(attached)
+                value, pdf = bsdf.eval_pdf(ctx, si, wo, with_light)
+                Ld = β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
+
+            # -------------------------- BSDF sampling ---------------------------
+
+            direction_sample, scale = bsdf.sample(
+                ctx, si, sampler.next_1d(proceed), sampler.next_2d(proceed), proceed
+            )
+            L += sign * dr.detach(Le + Ld)
+            with dr.resume_grad(when=not primal):
+                if not primal:
+                    onward = L * dr.relative_grad(bsdf.eval(ctx, si, direction_sample.wo, proceed))
+                    Lo = Le + Ld + onward
+                    # Not attached where positions alone are differentiated.
+                    if dr.grad_enabled(Lo):
+                        if mode == dr.ADMode.Backward:
+                            dr.backward_from(δL * Lo)
+                        else:
+                            δL = δL + dr.forward_to(Lo)
+            β = β * scale
+            η = path.η * direction_sample.eta
+            onwards = si.spawn_ray(si.to_world(direction_sample.wo))
+
+            # ------------------------ Stopping criterion ------------------------
+
+            largest = dr.max(mi.unpolarized_spectrum(β))
+            survival = dr.minimum(largest * dr.square(η), 0.95)
+            roulette = depth >= self.rr_depth
+            proceed &= (largest > 0) & (~roulette | (sampler.next_1d(proceed) < survival))
+            β = dr.select(roulette, β * dr.rcp(survival), β)
+            is_delta: Any = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
+            depth = dr.select(si.is_valid(), depth + 1, depth)
+            last_si = dr.detach(si)
+            end = _Path(onwards, depth, L, δL, β, η, last_si, direction_sample.pdf, is_delta)
+            return proceed, sampler, end
+
+        start = _Path(
+            mi.Ray3f(dr.detach(ray)),
+            mi.UInt32(0),
+            mi.Spectrum(0 if primal else state_in),
+            mi.Spectrum(0 if δL is None else δL),
+            mi.Spectrum(1),
+            mi.Float(1),
+            dr.zeros(mi.SurfaceInteraction3f),
+            mi.Float(1),
+            mi.Bool(True),
+        )
+        state = (mi.Bool(active), sampler, start)
+        label = f"splat_path ({mode.name})"
+        end = dr.while_loop(state, lambda active, *_: active, bounce, label=label)[2]
+        return end.L if primal else end.δL, end.depth != 0, [], end.L
+
+    def _layer(self, ray: Any, active: Bool) -> tuple[Any, Float]:
+        """Return the radiance that the Gaussians on a segment emit, and their transmittance."""
+        assert self.splats
+        color, transmittance = self.splats.trace(ray, active)
+        alpha = 1 - transmittance
+        mean = color * dr.select(alpha > 0, dr.rcp(alpha), 0)
+        return alpha * radiance(mean, self.clipped, self.srgb), transmittance
+
+    def _to_light(self, si: Any, ds: Any, active: Bool) -> Float:
+        """Return the transmittance between a surface and a sampled light."""
+        assert self.splats
+        ray = si.spawn_ray_to(ds.p)
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        ray.d = ds.d
+        ray.maxt = dr.select(far, dr.largest(mi.Float), ds.dist)
+        return self.splats.transmittance(ray, active)
+
+    def to_string(self) -> str:
+        return f"SplatPathIntegrator[max_depth = {self.max_depth}, clipped = {self.clipped}]"

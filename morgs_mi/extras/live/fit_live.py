@@ -1,0 +1,318 @@
+"""The loop on live cameras: whenever it is ready, it fits the newest images; those between are
+dropped.
+
+The frames of the stream are numbered in succession, since the loop and its stream know no others;
+the report has the time of each. The calibration and the fitted images are a capture like any other:
+a stream can be evaluated on it, and its frames fitted again.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import count
+from math import inf
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
+from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.layouts.reader_registry import find_reader
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.files import atomic_path, locked_folder, write_json
+from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.png import png_bytes
+from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.threads import in_background, map_in_threads
+from morgs_mi.extras.calibration.calibrate import calibrate
+from morgs_mi.extras.live.cameras import CameraFeed, FrameSet
+from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
+from morgs_mi.extras.live.sources import Source, open_feed
+from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.fit_capture import Prepared, push_frame
+from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
+from morgs_mi.stream_loop import StreamLoop
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """Report of one frame of a live fit."""
+
+    frame: int  #: Its index in the stream.
+    time: float  #: Between the first images and its images, s.
+    latency: float  #: Between its images and the end of its fit, s.
+    skew: float  #: Largest difference in time between two of its images, s.
+    dropped: int  #: Number of images of each camera that were dropped after the frame before.
+    problems: tuple[str, ...] = ()  #: One sentence per missing image.
+
+
+@interrupts_raised()
+def fit_live(
+    sources: Sequence[Source],
+    out: str | Path,
+    live: LiveConfig | None = None,
+    config: StreamConfig | None = None,
+    on_frame: Callable[[LiveFrame, FrameReport], None] | None = None,
+    on_stage: Report | None = None,
+) -> list[LiveFrame]:
+    """Fit live cameras into OUT/stream.morgs until they end, or until Ctrl-C after the first frame.
+
+    OUT/capture has the calibration and the images that were fitted, OUT/report.json the frames with
+    their times.
+
+    Args:
+        sources: the cameras, see `open_feed`.
+        out: folder, made if missing.
+        live: settings of the cameras.
+        config: settings of the loop; None: `LIVE_STREAM`.
+        on_frame: called when a frame is in the stream.
+        on_stage: called with (name, done, total) of the work up to the first frame.
+
+    Returns:
+        The reports of all frames in the stream.
+
+    Raises:
+        FileExistsError: OUT has the capture of an earlier fit.
+        OSError: a source cannot be opened, or the output cannot be written; the stream ends with a
+            complete frame.
+        ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be
+            calibrated or do not have the calibrated sizes.
+    """
+    out = Path(out)
+    live = live or LiveConfig()
+    live.check()
+    check_outputs(out)
+    folder = out / "capture"
+    if folder.exists():
+        raise FileExistsError(
+            f"{folder}: expected no capture, got that of an earlier fit; choose another "
+            "folder for this one."
+        )
+    calibration = None if live.calibration is None else read_calibration(live)
+    names = calibration and [camera.name for camera in calibration.cameras]
+    report = on_stage or (lambda *_: None)
+    with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
+        report("Waiting for the cameras", 0, 1)
+        first = feed.newest()
+        if first is None:
+            raise ValueError("fit_live(): expected images of the cameras, got none.")
+        report("Waiting for the cameras", 1, 1)
+        capture = begin_capture(folder, feed.names, first.images, live, calibration, on_stage)
+        return _fit(
+            _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
+        )
+
+
+def read_calibration(config: LiveConfig) -> Calibration:
+    """Return the cameras of an earlier capture of the same rig.
+
+    Raises:
+        FileNotFoundError, ValueError: it is missing or broken.
+    """
+    folder = config.calibration
+    if folder is None or not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder}: expected a calibrated capture of the cameras, found none; check the path."
+        )
+    calibration = find_reader(folder).read(folder)
+    if any(calibration.masks):
+        _LOG.warning("%s: its masks are not used by a live fit.", folder)
+    return calibration.without(folder, config.without)
+
+
+def begin_capture(
+    folder: Path,
+    names: Sequence[str],
+    images: Sequence[np.ndarray | None],
+    config: LiveConfig,
+    calibration: Calibration | None = None,
+    on_stage: Report | None = None,
+) -> Capture:
+    """Write the first images and the calibration of live cameras, and return the capture, which has
+    one frame.
+
+    Args:
+        folder: is made, and must not exist.
+        names: names of the cameras.
+        images: one per camera, uint8 [H, W, 3], RGB.
+        config: settings.
+        calibration: of the cameras; None: they are calibrated by the images.
+        on_stage: called with (name, done, total) of the calibration.
+
+    Raises:
+        OSError: the disk is full or not writable.
+        ValueError: the cameras cannot be calibrated, or the images do not have the calibrated
+            sizes.
+    """
+    try:
+        write_images(folder, names, images, 0)
+        write_json(folder / CAPTURE, {"fps": config.fps})
+        if calibration is not None:
+            write_colmap(
+                folder / "sparse" / "0",
+                calibration.cameras,
+                calibration.points,
+                calibration.point_colors,
+                calibration.lenses,
+            )
+        else:
+            try:
+                calibrate(folder, progress=on_stage)
+            except ValueError as error:
+                error.add_note(
+                    f"The images are in {folder}: calibrate them with morgs-mi calibrate, which "
+                    "has more options, and pass that folder with --calibration."
+                )
+                raise
+        # A camera may stop: later frames are read without its images.
+        return load_capture(
+            folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True)
+        )
+    except (OSError, ValueError) as error:
+        # The fit can be started again; images that cannot be calibrated stay.
+        if calibration is not None or isinstance(error, OSError):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def write_images(
+    folder: Path, names: Sequence[str], images: Sequence[np.ndarray | None], frame: int
+) -> None:
+    """Write the images of a frame into a capture, side by side.
+
+    Raises:
+        OSError: the disk is full or not writable.
+    """
+
+    def write(view: int) -> None:
+        image = images[view]
+        if image is not None:
+            file = folder / names[view] / f"{frame:04d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(file, "fit_live()") as partial:
+                partial.write_bytes(png_bytes(image))
+
+    map_in_threads(write, range(len(names)))
+
+
+@dataclass
+class _LiveFrames:
+    """Frames of a live capture, processed like the frames of any capture."""
+
+    feed: CameraFeed  # cameras
+    capture: Capture  # capture of their first images
+    first: FrameSet  # these images
+    config: LiveConfig
+    missing_names: set[str] = field(default_factory=set)  # cameras without an image before
+
+    def __iter__(self) -> Iterator[tuple[FrameSet, PartialFrame]]:
+        """Yield whenever the next frame is asked for the newest images, as recorded and as
+        processed.
+        """
+        frame_set = self.first
+        end = inf
+        for frame in count():
+            yield frame_set, self._processed(frame_set, frame)
+            end = min(end, time.monotonic() + (self.config.seconds or inf))
+            if frame + 1 == self.config.frames:
+                return
+            if (frame_set := self.feed.newest(frame_set)) is None:
+                _LOG.warning("the fit ends after frame %d: %s", frame, self.feed.ended())
+            if frame_set is None or frame_set.time > end:
+                return
+
+    def _processed(self, frame_set: FrameSet, frame: int) -> PartialFrame:
+        """Return the processed images of a frame set; a camera that has none, or none of its size,
+        is logged once.
+        """
+        names = self.capture.names
+        problems: dict[str, str] = {}
+        for k, image in enumerate(frame_set.images):
+            recorded_size = self.capture.recorded_sizes[k]
+            if image is None:
+                problems[names[k]] = self.feed.problem(k)
+            elif (size := image.shape[1::-1]) != recorded_size:
+                sizes = (*recorded_size, *size)
+                problems[names[k]] = "expected an image of {}x{}, got {}x{}".format(*sizes)
+        for name in problems.keys() - self.missing_names:
+            _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
+        self.missing_names = set(problems)
+
+        def process(view: int) -> np.ndarray | None:
+            image = frame_set.images[view]
+            if image is None or names[view] in problems:
+                return None
+            return self.capture.process(view, image)
+
+        images = map_in_threads(process, range(len(frame_set.images)))
+        sentences = tuple(f"{name}: {problem}" for name, problem in problems.items())
+        return PartialFrame(frame, tuple(images), sentences)
+
+
+def _fit(
+    frames: _LiveFrames,
+    out: Path,
+    config: StreamConfig,
+    on_frame: Callable[[LiveFrame, FrameReport], None] | None,
+    on_stage: Report,
+) -> list[LiveFrame]:
+    """Fit live frames into a locked folder."""
+    capture = frames.capture
+    train = capture.train_views
+    metadata = stream_metadata(capture, next(capture.partial_frames()), config)
+    del metadata["num_frames"]  # not known yet
+    prepared = Prepared.of(capture, config, Progress(on_stage))
+    frames.capture = prepared.capture
+    loop = StreamLoop.of(prepared.capture, config)
+    rows: list[LiveFrame] = []
+    with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
+        try:
+            for frame_set, frame in frames:
+                writing_task = in_background(partial(_record, frames, out, frame_set, frame))
+                packet, report = push_frame(
+                    loop, frame, train, None if rows else on_stage, None, recording.show
+                )
+                report = prepared.completed(report, loop.gaussians, frame, config)
+                writing_task.result()
+                row = LiveFrame(
+                    frame.index,
+                    frame_set.time - frames.first.time,
+                    time.monotonic() - frame_set.time,
+                    frame_set.skew,
+                    frame_set.dropped,
+                    frame.problems,
+                )
+                live = [asdict(r) for r in (*rows, row)]
+                recording.push(packet, report, loop.state.coded, live=live)
+                rows.append(row)
+                if on_frame is not None:
+                    on_frame(row, report)
+        except KeyboardInterrupt:
+            if not rows:
+                raise
+        except OSError as error:
+            if rows:
+                error.add_note(f"{out / 'stream.morgs'} ends with frame {rows[-1].frame}.")
+            raise
+    return rows
+
+
+def _record(frames: _LiveFrames, out: Path, frame_set: FrameSet, frame: PartialFrame) -> None:
+    """Write the recorded images of a frame into the capture, which has the first frame's."""
+    if frames.config.record and frame.index:
+        images = [
+            None if result is None else image
+            for image, result in zip(frame_set.images, frame.images, strict=True)
+        ]
+        write_images(out / "capture", frames.capture.names, images, frame.index)

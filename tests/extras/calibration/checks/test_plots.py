@@ -1,0 +1,71 @@
+"""The plot of the rig."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import same_color
+from matplotlib.figure import Figure
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.plots import check_plot
+from morgs_mi.extras.calibration.checks.plots import draw_rig, write_rig
+from tests.assertions import assert_close
+from tests.scenes.cameras import circle, look_at_cameras
+
+
+def test_draw_rig__draws_cameras_at_their_positions() -> None:
+    """Cameras on a line lie side by side seen from above; the held-out one is red, and distant
+    points are cut off.
+    """
+    cameras = [
+        Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)
+    ]
+    points = np.array([[0.0, 0, 3], [1e6, 0, 0]])
+    green = np.array([[0, 1.0, 0], [0, 1, 0]])
+    figure = Figure()
+    draw_rig(figure, cameras, (points, green), test_views=(1,))
+    above = figure.axes[0]
+    names = above.texts[:3]
+    assert_close(np.array([name.xy for name in names]), [(-1, 0), (0, 0), (1, 0)], atol=1e-6)
+    assert [name.get_text() for name in names] == ["0", "1", "2"]
+    frusta = above.lines[::2]
+    assert [same_color(line.get_color(), "tab:red") for line in frusta] == [False, True, False]
+    # Ahead of the cameras is up.
+    assert all(np.asarray(line.get_ydata()).min() >= -1e-6 for line in frusta)
+    (cloud,) = above.collections
+    assert_close(np.asarray(cloud.get_offsets()), [(0, 3)], atol=1e-6)
+    assert_close(cloud.get_facecolor()[:, :3], [(0, 1, 0)])
+    assert np.mean(above.get_xlim()) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_draw_rig__draws_any_rig(count: int) -> None:
+    cameras = look_at_cameras(circle(2 * np.pi * np.arange(count) / count, z=0), 60, up=(0, 0, 1))
+    figure = Figure()
+    draw_rig(figure, cameras, (np.zeros((0, 3)), np.zeros((0, 3))))
+    assert [len(axes.lines) for axes in figure.axes] == [2 * count] * 2
+    figure.canvas.draw()
+
+
+@pytest.mark.filterwarnings("error")
+def test_write_rig__writes_vector_graphics_with_any_names(
+    textured_capture: Capture, tmp_path: Path
+) -> None:
+    name = "$\\frac$ カメラ"
+    cameras = tuple(replace(camera, name=name) for camera in textured_capture.cameras)
+    write_rig(tmp_path / "new" / "rig.svg", replace(textured_capture, cameras=cameras))
+    assert "<svg" in (tmp_path / "new" / "rig.svg").read_text()
+
+
+def test_check_plot__names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(
+        ValueError, match=r"rig.png: a plot needs .* matplotlib; pip install 'morgs-mi\[plots\]'"
+    ):
+        check_plot(tmp_path / "rig.png")

@@ -1,0 +1,119 @@
+"""The reprojection check and triangulation on textured planes seen from known cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.features import detect, match_views
+from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
+from morgs_mi.extras.calibration.checks.rig_check import check_rig
+from tests.scenes.textured import turned, with_cameras
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.mark.slow
+def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures) -> None:
+    check = check_rig(capture, shared)
+    assert check.fits
+    assert check.advice == "the poses fit the images."
+    assert check.pairs == 15
+    assert check.matches > 3000
+    assert sum(camera.matches for camera in check.cameras) == 2 * check.matches
+    # The images are exact; SIFT locates features to some hundredths of a pixel.
+    assert check.error < 0.05
+    assert max(camera.error for camera in check.cameras) < 0.1
+    assert [(camera.verdict, camera.advice) for camera in check.cameras] == 6 * [("fits", "")]
+
+
+def test_check_rig__does_not_check_a_camera_without_matches(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    others = tuple(match for match in shared.matches if 3 not in match.views)
+    check = check_rig(capture, SharedFeatures(shared.features, others))
+    assert check.fits is None
+    assert check.advice == "the poses of 5 of 6 cameras fit the images; not checked: cam3."
+    assert (check.cameras[3].fits, check.cameras[3].matches) == (None, 0)
+    assert np.isnan(check.cameras[3].error)
+    assert (
+        "no matches with any other camera: check that the clip is of this scene"
+        in check.cameras[3].advice
+    )
+
+
+def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    some = tuple(match for match in shared.matches if 5 not in match.views or match.views == (4, 5))
+    wrong = with_cameras(capture, lambda i, c: turned(c, 20) if i == 4 else c)
+    check = check_rig(wrong, SharedFeatures(shared.features, some))
+    assert [camera.fits for camera in check.cameras] == [*4 * [True], False, None]
+    assert "matches only with cameras that do not fit" in check.cameras[5].advice
+
+
+def test_check_rig__is_undecided_without_matches(capture: Capture) -> None:
+    blank = (detect(np.full((48, 64, 3), 128, np.uint8)),) * 6
+    check = check_rig(capture, SharedFeatures(blank, tuple(match_views(blank, capture.cameras))))
+    assert (check.fits, check.matches) == (None, 0)
+    assert np.isnan(check.error)
+    assert "too few matches" in check.advice
+
+
+def test_check_rig__is_undecided_with_fewer_than_fifty_matches(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    first = shared.matches[0]
+    for count, fits in ((49, None), (50, True)):
+        few = SharedFeatures(shared.features, (replace(first, features=first.features[:count]),))
+        check = check_rig(capture, few)
+        assert [check.cameras[view].fits for view in first.views] == [fits, fits]
+    assert "the poses of 2 of 6 cameras fit the images; not checked: cam2, cam3" in check.advice
+
+
+def test_triangulate_points__ignores_the_held_out_view(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    points = triangulate_points(capture, shared)
+    assert len(points.points) == len(points.point_colors) > 1000
+    held_out = replace(capture, test_views=(3,))
+    fewer = triangulate_points(held_out, shared)
+    features = list(shared.features)
+    features[3] = detect(None)
+    others = tuple(match for match in shared.matches if 3 not in match.views)
+    blind = SharedFeatures(tuple(features), others)
+    np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
+    assert len(fewer.points) < len(points.points)
+    wrong = with_cameras(capture, lambda _, c: replace(c, viewmat=FLIP @ c.viewmat))
+    assert len(triangulate_points(wrong, shared).points) == 0
+
+
+@pytest.mark.slow
+def test_match_capture__finds_features_at_the_recorded_size(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    small = load_capture(capture.path, 4)
+    matches = match_capture(small)
+    assert [len(f.points) for f in matches.features] == [len(f.points) for f in shared.features]
+    assert check_rig(small, matches).error == pytest.approx(
+        check_rig(capture, shared).error, abs=0.01
+    )
+    points = triangulate_points(small, matches).points
+    count = len(triangulate_points(capture, shared).points)
+    assert len(points) == pytest.approx(count, rel=0.01)
+
+
+def test_triangulate_points__matches_distant_views_with_their_poses(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    ends = replace(
+        capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=()
+    )
+    unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
+    points = triangulate_points(ends, unmatched)
+    assert len(points.points) > 50
+    wrong = with_cameras(ends, lambda i, c: replace(c, viewmat=FLIP @ c.viewmat) if i else c)
+    assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)

@@ -1,0 +1,36 @@
+"""The import of pycolmap, whose logging library handles signals."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import morgs_mi
+
+SCRIPT = """
+import signal, time
+from morgs_mi.extras.calibration.calibrate import import_pycolmap
+from morgs_mi.core.interrupts import interruptible
+
+with interruptible():
+    import_pycolmap()
+    try:
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(1)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+def test_import_pycolmap__keeps_the_handler_of_sigterm():
+    result = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "interrupted\n", "")
+
+
+def test_import_pycolmap__is_called_by_the_calibration_alone():
+    package = Path(morgs_mi.__file__).parent
+    users = [path for path in package.rglob("*.py") if "pycolmap()" in path.read_text("utf-8")]
+    assert {path.parent for path in users} == {package / "studio/calibration"}

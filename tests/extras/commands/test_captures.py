@@ -1,0 +1,98 @@
+"""`morgs-mi info` for a capture."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from morgs_mi.extras.commands import captures as info
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.extras.calibration.timing import TimeOffsets
+from morgs_mi.io.video_writer import write_video
+from tests.cli.commands import assert_refused
+from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("option", ["--no-check", "--help"])
+def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "morgs_mi", "info", str(capture), option]
+        result = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (result.returncode, result.stderr) == (1, "standard output: No space left on device.\n")
+
+
+def test_info__lists_the_cameras_of_a_capture(capture: Path, run) -> None:
+    status, out, _ = run("info", capture, "--no-check")
+    assert status == 0
+    assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
+    assert f"{FRAMES} frames at 25 fps, 150 points, without ground truth." in out
+    assert "COLMAP" in out
+    assert "Reprojection" not in out
+
+
+@pytest.mark.slow
+def test_info__prints_complete_columns_and_a_verdict_per_camera(
+    textured_capture: Capture, tmp_path: Path, run
+) -> None:
+    path = tmp_path / ("capture of a rig in a folder with a long name" * 2)
+    shutil.copytree(textured_capture.path, path)
+    write_video(path / "cam1.mkv", [np.full((240, 320, 3), 128, np.uint8)], 30)
+    write_video(path / "cam2.mkv", [next(textured_capture.frames()).images[2][::-1, ::-1]], 30)
+    status, out, _ = run("info", path)
+    assert status == 0
+    for row in (
+        r"cam1 .*train +0 +- +not checked",
+        r"cam2 .*train +\d+ +\d+\.\d\d +does not fit",
+        r"cam3 .*train +\d+ +0\.0\d +fits",
+    ):
+        assert re.search(row, out)
+    assert "the poses of cam2 do not fit the images; not checked: cam1." in out
+    assert "cam1 not checked: no matches with any other camera: check" in out
+    assert "cam2 does not fit: its images are upside down" in out
+
+
+@pytest.mark.slow
+def test_info__prints_the_check_and_draws_the_rig(
+    textured_capture: Capture, tmp_path: Path, run
+) -> None:
+    path = textured_capture.path
+    plot = tmp_path / "new" / "rig.png"
+    times = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    status, out, _ = run("info", path, "--plot", plot)
+    assert status == 0
+    assert "1 frames at 30 fps, without points (" in out
+    assert out.startswith("Views between the cameras will be good: 5 cameras, 7 degrees apart")
+    assert "\nReprojection check: median 0.0" in out
+    assert "in 15 pairs; the poses fit the images." in out
+    assert cv2.imread(str(plot)).shape == (760, 1440, 3)
+    assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == times
+    refused = run("info", path, "--plot", tmp_path / "rig.gif")
+    assert_refused(refused, "the suffix of a plot must be .png, .jpg, .svg or .pdf, got '.gif'")
+
+
+def test_info__prints_the_time_offsets_as_options(
+    capture: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = (*NAMES[:3], "other")
+    offsets = dict(zip(names, (0.0, -0.254, 1.5, 0.7), strict=True))
+    errors = dict(zip(names, (0.0, 0.023, 0.41, 1.0), strict=True))
+    time_offsets = TimeOffsets(offsets, errors, NAMES[0], 0.3, converged=False)
+    monkeypatch.setattr(info, "estimate_time_offsets", lambda *_: time_offsets)
+    status, out, _ = run("info", capture, "--no-check", "--time")
+    assert status == 0
+    out = " ".join(out.split())
+    assert f"pass --offset {NAMES[1]} -0.25 {NAMES[2]} 1.50 for the time of {NAMES[0]}." in out
+    assert f"Standard errors of these offsets: up to 0.41 frames ({NAMES[2]})." in out
+    assert f"Uncertain: {NAMES[2]} (0.41). Their images hardly depend on the clocks" in out
+    assert "Clocks not found: other; keep what is known of them." in out
+    assert "The offsets still change by 0.30 frames" in out

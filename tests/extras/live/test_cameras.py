@@ -1,0 +1,195 @@
+"""Images of cameras that are read side by side: the newest ones that agree best in time, and what
+faults do.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from queue import SimpleQueue
+from threading import Timer
+
+import numpy as np
+import pytest
+
+from morgs_mi.extras.live.cameras import CameraFeed, Shot, _nearest, _simultaneous
+
+IMAGE = np.zeros((4, 6, 3), np.uint8)
+
+
+class Source:
+    """A camera that delivers an image whenever the test requests it; None ends it, an error is
+    raised.
+    """
+
+    def __init__(self, shots: int = 0) -> None:
+        self._images: SimpleQueue = SimpleQueue()
+        self.deliver(shots)
+
+    def deliver(self, count: int = 1) -> None:
+        for _ in range(count):
+            self._images.put(IMAGE)
+
+    def end(self, error: Exception | None = None) -> None:
+        self._images.put(error)
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        while (image := self._images.get()) is not None:
+            if isinstance(image, Exception):
+                raise image
+            yield image
+
+
+@pytest.fixture
+def opened():
+    """Feeds that are closed in the end, with their sources."""
+    feeds: list[tuple[CameraFeed, list[Source]]] = []
+
+    def open_feed(*shots: int, timeout: float = 0.3, warm_up: float = 0.0):
+        sources = [Source(count) for count in shots]
+        cameras = {f"cam{k}": source for k, source in enumerate(sources)}
+        feeds.append((CameraFeed(cameras, timeout, warm_up), sources))
+        return feeds[-1]
+
+    yield open_feed
+    for feed, sources in feeds:
+        for source in sources:
+            source.end()
+        feed.close()
+
+
+def wait_for(feed: CameraFeed, *counts: int) -> None:
+    """Wait until the threads have read that many images."""
+    for camera, count in zip(feed._cameras, counts, strict=True):
+        while not camera.shots or camera.shots[-1].number < count - 1:
+            time.sleep(0.001)
+
+
+def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_it() -> None:
+    fast = [Shot(IMAGE, time, 0) for time in (0.0, 0.033, 0.066)]
+    slow = [Shot(IMAGE, time, 0) for time in (0.01, 0.04)]
+    stopped = [Shot(IMAGE, -9.0, 0)]
+    assert _nearest([fast, slow], [True, True]) == [fast[1], slow[1]]
+    assert _nearest([fast, []], [True, True]) is None
+    assert _nearest([fast, []], [True, False]) == [fast[2], None]
+    assert _nearest([fast, stopped], [True, True]) is None, "not of one time"
+    assert _simultaneous([fast, slow, [], stopped]) == [True, True, False, False]
+
+
+def test_CameraFeed__skips_what_arrived_during_a_fit(opened) -> None:
+    feed, (a, b) = opened(1, 1)
+    first = feed.newest()
+    assert (first.numbers, first.dropped) == ((0, 0), 0)
+    a.deliver(7)
+    b.deliver(9)
+    wait_for(feed, 8, 10)
+    second = feed.newest(first)
+    ahead = np.array((7, 9)) - second.numbers
+    assert ahead.min() == 0, "the newest of one camera"
+    assert ahead.max() < 4
+    assert second.dropped == min(second.numbers) - 1, "of the camera that dropped fewer"
+    assert second.time >= first.time
+    assert 0 <= second.skew < 0.3
+
+
+def test_CameraFeed__waits_for_new_images_of_all(opened) -> None:
+    feed, (a, b) = opened(1, 1, timeout=5)
+    first = feed.newest()
+    a.deliver()
+    wait_for(feed, 2, 1)
+    b.deliver()
+    assert feed.newest(first).numbers == (1, 1)
+
+
+def test_CameraFeed__leaves_out_a_silent_camera_until_it_is_back(opened) -> None:
+    feed, (a, b) = opened(1, 1)
+    first = feed.newest()
+    a.deliver()
+    start = time.monotonic()
+    second = feed.newest(first)
+    waited = time.monotonic()
+    a.deliver()
+    third = feed.newest(second)
+    assert waited - start >= 0.3
+    assert time.monotonic() - waited < 0.2, "it is not waited for again"
+    assert second.images[1] is None is third.images[1]
+    assert feed.problem(1) == "no image for 0.3 s"
+    a.deliver()
+    b.deliver()
+    wait_for(feed, 4, 2)
+    assert feed.newest(third).numbers == (3, 1)
+
+
+def test_CameraFeed__leaves_out_a_camera_that_ends_at_once_and_ends_with_the_last(opened) -> None:
+    feed, (a, b) = opened(1, 1, timeout=60)
+    first = feed.newest()
+    b.end(ValueError("cable pulled"))
+    a.deliver()
+    second = feed.newest(first)
+    assert [image is not None for image in second.images] == [True, False]
+    assert feed.problem(1) == "cable pulled"
+    a.end()
+    assert feed.newest(second) is None
+    assert feed.problem(0) == "it has ended"
+
+
+def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
+    feed, (_, b) = opened(1, 0)
+    with pytest.raises(
+        ValueError, match=r"images of cam1, got none \(it is silent\); .* longer than 0.3 s"
+    ):
+        feed.newest()
+    b.end()
+    failing, (_, c) = opened(1, 0, timeout=60)
+    c.end(OSError("cannot open the source 63"))
+    with pytest.raises(OSError, match="cannot open the source 63"):
+        failing.newest()
+
+
+def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened) -> None:
+    feed, (a, b) = opened(1, 0, timeout=5, warm_up=0.2)
+    start = time.monotonic()
+    Timer(0.1, b.deliver).start()
+    Timer(0.25, lambda: (a.deliver(), b.deliver())).start()
+    first = feed.newest()
+    assert time.monotonic() - start >= 0.3
+    assert (first.numbers, first.dropped) == ((1, 1), 0)
+    feed, (clip,) = opened(2, timeout=5, warm_up=5)
+    start = time.monotonic()
+    clip.end()
+    assert feed.newest() is not None, "a short clip"
+    assert time.monotonic() - start < 1
+
+
+def test_CameraFeed__refuses_images_of_different_times(opened) -> None:
+    feed, (a, b) = opened(1, 0, timeout=0.7)
+    a.end()
+    Timer(0.6, b.deliver).start()
+    with pytest.raises(
+        ValueError, match=r"simultaneous images of cam0, cam1, got none that arrived within 0.5 s"
+    ):
+        feed.newest()
+
+
+@pytest.mark.slow
+def test_CameraFeed__is_closed_when_the_interpreter_ends() -> None:
+    """A thread that executes library code after the end of the interpreter aborts the process."""
+    script = """
+from threading import Event
+import numpy as np
+from morgs_mi.extras.live.cameras import CameraFeed
+
+def images():
+    yield np.zeros((4, 6, 3), np.uint8)
+    closed.wait()
+    print("closed")
+
+closed = Event()
+CameraFeed({"cam0": images()}, 5, closed=closed).newest()
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "closed\n"

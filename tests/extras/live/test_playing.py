@@ -1,0 +1,131 @@
+"""Videos that are played side by side: at their speed, at one time, again and again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+
+from morgs_mi.extras.live import sources as module
+from morgs_mi.extras.live.live_config import LiveConfig
+from morgs_mi.extras.live.sources import ClipClock, is_video, open_feed, play
+from morgs_mi.io.video_writer import write_video
+
+
+def clip(path: Path, count: int, fps: float = 50) -> Path:
+    """Write a video of grey images, each ten levels brighter than the one before."""
+    write_video(path, [np.full((16, 16, 3), 10 * k, np.uint8) for k in range(count)], fps)
+    return path
+
+
+def played(paths: list[Path], count: int, loop: bool) -> list[np.ndarray]:
+    """Return the time and the number [count, 2] of the first images of each clip."""
+    clock = ClipClock(len(paths))
+    rows = [[] for _ in paths]
+    start = time.monotonic()
+
+    def read(k: int) -> None:
+        for image in islice(play(paths[k], clock, Event(), k, loop), count):
+            rows[k].append((time.monotonic() - start, int(image[0, 0, 0]) // 10))
+
+    threads = [Thread(target=read, args=(k,), daemon=True) for k in range(len(paths))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    return [np.array(each) for each in rows]
+
+
+def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
+    (rows,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
+    times, numbers = rows.T
+    assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
+    assert times[-1] - times[0] >= 5 / 20 - 0.01
+    assert np.all(np.diff(times) > 0.02), "not all at once"
+
+
+def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None:
+    lengths = ((6, 50), (9, 50), (5, 25))
+    paths = [clip(tmp_path / f"{count}.mkv", count, fps) for count, fps in lengths]
+    times, numbers = np.moveaxis(played(paths, 20, loop=True), 2, 0)
+    assert numbers[0].tolist() == [*range(6)] * 3 + [0, 1]
+    assert numbers[1].tolist() == numbers[0].tolist(), "without its last three"
+    slow = [0, 1, 2] * 6 + [0, 1]
+    assert numbers[2].tolist() == slow, "at half the rate, without its last two"
+    starts = np.stack([time[number == 0][:4] for time, number in zip(times, numbers, strict=True)])
+    # The median, because a busy machine may show one image late.
+    assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.019, "within an interval"
+
+
+def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    def timed(path: Path) -> Iterator[tuple[np.ndarray, float, float]]:
+        for k in range(20):
+            time.sleep(0.02 * (path.name == "slow"))
+            yield np.full((2, 2, 3), 10 * k, np.uint8), k / 100, 1 / 100
+
+    monkeypatch.setattr(module, "timed_images", timed)
+    slow, fast = played([Path("slow"), Path("fast")], 99, loop=False)
+    assert slow[:, 1].tolist() == fast[:, 1].tolist() == [*range(20)]
+    assert (fast[2:, 0] > slow[:-2, 0]).all()
+    assert (slow[2:, 0] > fast[:-2, 0]).all()
+
+
+def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
+    """Also while it waits for another clip, which has not begun."""
+    closed = Event()
+    reader = Thread(
+        target=list,
+        args=(play(clip(tmp_path / "a.mkv", 3), ClipClock(2), closed, loop=True),),
+        daemon=True,
+    )
+    reader.start()
+    time.sleep(0.2)
+    assert reader.is_alive()
+    closed.set()
+    reader.join(1)
+    assert not reader.is_alive()
+
+
+def test_play__refuses_what_has_no_image(tmp_path: Path) -> None:
+    (tmp_path / "text.mkv").write_text("no video")
+    with pytest.raises(OSError, match=r"text.mkv: expected a video, got 8 bytes"):
+        next(play(tmp_path / "text.mkv", ClipClock(), Event()))
+
+
+def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("clip.mp4", "cam.sdp")]
+    for path in paths:
+        path.touch()
+    sources = (*paths, tmp_path, tmp_path / "nowhere.mp4", 0)
+    assert [is_video(source) for source in sources] == [True, False, False, False, False]
+
+
+def test_open_feed__repeats_videos_alone() -> None:
+    with pytest.raises(
+        ValueError,
+        match=r"`loop` repeats videos, got none in 2 \(0, rtsp://10.0.0.10/live\); leave it",
+    ):
+        open_feed([0, "rtsp://10.0.0.10/live"], LiveConfig(loop=True))
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_open_feed__of_videos_begins_with_their_first_images(tmp_path: Path, loop: bool) -> None:
+    feed = open_feed(
+        [clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop)
+    )
+    try:
+        frame_set = first = feed.newest()
+        assert first is not None
+        assert max(first.numbers) < 8, "without a time to adjust the exposure"
+        while frame_set is not None and frame_set.numbers[0] < 25:
+            frame_set = feed.newest(frame_set)
+        assert (frame_set is None) != loop
+        if frame_set is None:
+            assert feed.ended() == "cam0, cam1: it has ended; --loop repeats videos"
+    finally:
+        feed.close()

@@ -1,0 +1,21 @@
+"""Rendered frames with their ground truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from morgs_mi.capture.truth import GroundTruth
+from morgs_mi.core.camera import Camera
+from morgs_mi.extras.synth.ground_truth import compute_ground_truth
+from morgs_mi.extras.synth.path_tracer import PathTracer
+
+FPS = 30.0
+
+
+def render_frame(tracer: PathTracer, camera: Camera, frame: int) -> tuple[np.ndarray, GroundTruth]:
+    """Return the image and the ground truth of a frame."""
+    time = frame / FPS
+    tracer.set_time(time)
+    surface = tracer.surface_points(camera)
+    poses = [tracer.poses(time + step / FPS) for step in (0, -1, 1)]
+    return tracer.render(camera, 16, frame), compute_ground_truth(camera, surface, *poses)

@@ -1,0 +1,133 @@
+"""Random scenes: what the seed draws, without rendering, and one small clip."""
+
+from __future__ import annotations
+
+import json
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.truth import load_truth
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
+
+# Not tests.scenes.
+from scenes.random import MOTIONS, Body, RandomScene, draw_scene  # pyright: ignore[reportMissingImports]
+from tests.assertions import assert_close
+
+NUM_SEEDS = 50
+FPS = 30.0
+TIMES = np.arange(90) / FPS
+SMALL = SynthConfig(frames=2, width=64, height=48, seed=1)
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[RandomScene]:
+    return [draw_scene(seed) for seed in range(NUM_SEEDS)]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    return synthesize("random", tmp_path_factory.mktemp("synth") / "random", SMALL)
+
+
+def thin_and_fast(scene: RandomScene) -> bool:
+    return any(
+        body.solid.kind == "rod" and body.motion != "static" and body.speed >= 7
+        for body in scene.bodies.values()
+    )
+
+
+def surface(body: Body, times: np.ndarray) -> np.ndarray:
+    """Return points of the surface farthest from the object's centre, over time [T, P, 3]."""
+    octahedron = body.solid.margin * np.concatenate([np.eye(3), -np.eye(3)])
+    points = (body.solid.points[:, None] + octahedron).reshape(-1, 3)
+    poses = np.stack([body.pose(time) for time in times])
+    return np.einsum("tij,pj->tpi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+
+
+@pytest.mark.slow
+def test_draw_scene__objects_are_in_the_room_and_in_view_and_never_touch(scenes):
+    for scene in scenes:
+        cameras = scene.rig.cameras(scene.recording.num_cameras, 320, 240)
+        for name, body in scene.bodies.items():
+            points = surface(body, TIMES[::3])
+            low = points.min(axis=(0, 1))
+            high = points.max(axis=(0, 1))
+            assert (low > np.array([-scene.half_width, -1e-6, -1.7])).all(), name
+            assert (high[:2] < [scene.half_width, 3.2]).all(), name
+            assert (low > body.bounds[0] - 0.01).all(), name
+            assert (high < body.bounds[1] + 0.01).all(), name
+            pixels = [camera.project(surface(body, TIMES[:8]))[0] for camera in cameras]
+            views = [((p > 0) & (p < [320, 240])).all() for p in pixels]
+            assert views[0]
+            assert np.mean(views) >= 0.75
+        for a, b in combinations(scene.bodies.values(), 2):
+            assert ((a.bounds[0] > b.bounds[1]) | (b.bounds[0] > a.bounds[1])).any()
+
+
+def test_draw_scene__speed_is_that_of_the_fastest_point_in_the_held_out_view(scenes):
+    for scene in scenes[:10]:
+        camera = scene.rig.cameras(2, 320, 240)[0]
+        for name, body in scene.bodies.items():
+            pixels = camera.project(surface(body, TIMES))[0]
+            fastest = np.linalg.norm(np.diff(pixels, axis=0), axis=-1).max()
+            # A frame covers up to a ninth of an oscillation, over which the mean speed is below the
+            # peak.
+            assert 0.7 * body.speed <= fastest <= 1.02 * body.speed, name
+
+
+def test_draw_scene__draws_all_parameters_from_their_ranges(scenes):
+    assert len({scene.rig for scene in scenes}) == NUM_SEEDS
+    for scene in scenes:
+        speeds = [body.speed for body in scene.bodies.values() if body.motion != "static"]
+        assert 4 <= scene.recording.num_cameras <= 16
+        assert scene.recording.spp in (4, 16, 49)
+        assert scene.recording.noise == 0 or 0.003 <= scene.recording.noise <= 0.02
+        assert 14 <= scene.rig.spread[0] <= 36
+        assert 2 <= len(speeds) <= 5
+        assert len(speeds) < len(scene.bodies) <= 10
+        assert min(speeds) >= 2
+        assert max(speeds) <= 12
+    bodies = [body for scene in scenes for body in scene.bodies.values()]
+    assert {body.motion for body in bodies} == {*MOTIONS, "static"}
+    kinds = {"ball", "box", "plate", "column", "dumbbell", "cross", "rod", "pendulum"}
+    assert {body.solid.kind for body in bodies} == kinds
+    # About half of the scenes have sensor noise, a swinging lamp, and a thin, fast rod.
+    features = [(s.recording.noise > 0, s.swing > 0, thin_and_fast(s)) for s in scenes]
+    shares = np.mean(features, axis=0)
+    assert (shares > 0.25).all()
+    assert (shares < 0.85).all()
+
+
+@pytest.mark.slow
+def test_synthesize__records_the_random_scene_of_a_seed(clip):
+    scene = draw_scene(1)
+    settings = json.loads((clip / "capture.json").read_text())
+    names = settings["objects"]
+    assert names[4:] == list(scene.bodies)
+    assert (settings["scene"], settings["spp"]) == ("random", scene.recording.spp)
+    assert settings["num_cameras"] == scene.recording.num_cameras
+    assert_close(settings["noise"], scene.recording.noise, rtol=1e-9)
+    camera = scene.rig.cameras(scene.recording.num_cameras, 64, 48)[0]
+    truth = load_truth(clip / "truth", "cam00", 1)
+    y, x = np.mgrid[:48, :64] + 0.5
+    points = camera.unproject(np.stack([x, y], axis=-1), truth.depth)
+    for name, body in scene.bodies.items():
+        mask = truth.ids == names.index(name)
+        assert mask.sum() > 3
+        assert (points[mask] > body.bounds[0] - 0.01).all()
+        assert (points[mask] < body.bounds[1] + 0.01).all()
+        assert (truth.mask[mask] == (body.motion != "static")).all()
+
+
+@pytest.mark.slow
+def test_synthesize__writes_the_same_bytes_for_the_same_seed(clip, tmp_path):
+    again = synthesize("random", tmp_path / "again", SMALL)
+    first, second = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (clip, again)
+    )
+    assert first.keys() == second.keys()
+    assert [str(file) for file in first if first[file] != second[file]] == []

@@ -1,0 +1,96 @@
+"""Scenes: files with a mistake, and what the scenes of this package show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.extras.synth.path_tracer import PathTracer
+from morgs_mi.extras.synth.scene import load_scene
+from tests.assertions import assert_close
+from tests.extras.synth.frames import render_frame
+
+
+def test_load_scene__accepts_dataclasses_with_postponed_annotations(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from __future__ import annotations\n"
+        "from dataclasses import dataclass, field\n"
+        "from morgs_mi.extras.synth.scene import Scene\n"
+        "@dataclass\n"
+        "class Part:\n"
+        "    size: float = 1.0\n"
+        "    below: list[Part] = field(default_factory=list)\n"
+        "def build(seed):\n"
+        "    return Scene(f'own{Part().size:g}', {}, {})\n"
+    )
+    assert load_scene(tmp_path / "own.py").name == "own1"
+
+
+@pytest.mark.parametrize(("name", "radius"), [("roller", 0.38), ("circler", 0.28)])
+def test_spheres__balls_roll_without_slipping(name, radius):
+    pose = load_scene("spheres").objects[name].pose
+    contact = np.linalg.inv(pose(0.4)) @ (pose(0.4)[:, 3] - [0, radius, 0, 0])
+    velocity = (pose(0.4 + 1e-5) - pose(0.4 - 1e-5)) / 2e-5
+    assert np.linalg.norm(velocity @ contact) < 1e-6
+    assert np.linalg.norm(velocity[:, 3]) > 0.1
+
+
+@pytest.mark.slow
+def test_thin__objects_move_farther_than_their_width():
+    tracer = PathTracer(load_scene("thin"))
+    _, truth = render_frame(tracer, tracer.scene.rig.cameras(3, 320, 240)[0], 5)
+    speed = np.linalg.norm(truth.motion, axis=-1)
+    assert np.percentile(speed[truth.mask], 90) > 8
+    # No moving object is wider than 10 pixels: an opening of 11 removes them.
+    opened = cv2.morphologyEx(truth.mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((11, 11)))
+    assert opened.sum() < 0.15 * truth.mask.sum()
+
+
+@pytest.mark.slow
+def test_flicker__images_change_where_surfaces_are_static():
+    tracer = PathTracer(load_scene("flicker"))
+    camera = tracer.scene.rig.cameras(3, 160, 120)[0]
+    images, truths = zip(*(render_frame(tracer, camera, frame) for frame in range(6)), strict=True)
+    still = ~np.any([truth.mask for truth in truths], axis=0)
+    light = np.array([image[still].mean(axis=-1) for image in images])
+    means = light.mean(axis=1)
+    assert (np.abs(np.diff(means)) / means[1:] > 0.01).sum() >= 4
+    # The lamp swings: the shading changes by more than a common factor.
+    shading = light / means[:, None]
+    assert np.percentile(np.abs(shading[0] - shading[-1]), 95) > 0.05
+
+
+def test_rig__test_view_is_at_the_centre():
+    cameras = load_scene("spheres").rig.cameras(10, 320, 240)
+    positions = np.array([camera.position for camera in cameras])
+    assert np.linalg.norm(positions[0] - positions[1:].mean(axis=0)) < 0.5
+    for camera in cameras:
+        assert_close(camera.project(np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("build = 3", r"scene.py: it must define `build\(seed\) -> Scene`"),
+        ("def build(): pass", r"scene.py: TypeError: build\(\) takes 0 positional arguments but 1"),
+        ("def build(seed): return {}", r"must be a .*Scene, got a dict; return Scene"),
+        (
+            "\ndef build(seed:\n",
+            "scene.py, line 2: SyntaxError: '.' was never closed; correct the scene",
+        ),
+        (
+            "import mitsuba as mi\ndef build(seed):\n    return mi.Bitmap('no.png')",
+            "scene.py, line 3: RuntimeError: .*no.png.*No such file",
+        ),
+    ],
+)
+def test_load_scene__names_the_file_and_line_of_a_mistake(tmp_path, monkeypatch, code, message):
+    (tmp_path / "scene.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    for path in (tmp_path / "scene.py", Path("scene.py")):
+        with pytest.raises(ValueError, match=message) as error:
+            load_scene(path)
+        assert str(path) in str(error.value)

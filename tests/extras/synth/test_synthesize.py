@@ -1,0 +1,217 @@
+"""Synthetic captures: their files, and the scenes that are refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import read_colmap
+from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
+from morgs_mi.capture.truth import load_truth
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.extras.synth.disturbances import Disturbances
+from morgs_mi.extras.synth.scene import Light, Object, Scene, load_scene
+from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.extras.synth.synthesize import synthesize
+from morgs_mi.extras.synth.textures import lights, textured
+from morgs_mi.io.video import open_frames
+from tests.assertions import assert_close
+
+TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
+
+
+@pytest.mark.slow
+def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
+    metadata = json.loads((clip / "capture.json").read_text())
+    assert metadata["test_view"] == 0
+    assert (metadata["fps"], metadata["num_frames"], metadata["seed"]) == (30.0, 3, 0)
+    expected = load_scene("arm").rig.cameras(3, 64, 48)
+    cameras, bounds = read_poses_bounds(
+        clip / "poses_bounds.npy", [camera.name for camera in expected]
+    )
+    model = read_colmap(clip / "sparse" / "0")
+    for ours, theirs, colmaps in zip(expected, cameras, model.cameras, strict=True):
+        assert_close(theirs.viewmat, ours.viewmat, atol=1e-6)
+        assert_close(colmaps.viewmat, ours.viewmat, atol=1e-6)
+        np.testing.assert_allclose(colmaps.K, ours.K)
+        assert colmaps.name == f"{ours.name}.png"
+        assert open_frames(clip / f"{ours.name}.mp4").num_frames == 3
+        assert len(list((clip / "frames" / ours.name).glob("*.png"))) == 3
+        assert len(list((clip / "truth" / ours.name).glob("*.exr"))) == 3
+    assert (bounds > 0).all()
+    assert (np.diff(bounds) > 0).all()
+
+
+@pytest.mark.slow
+def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
+    points = read_colmap(clip / "sparse" / "0").points.astype(float)
+    assert len(points) > 1000
+    distances = []
+    for camera in load_scene("arm").rig.cameras(3, 64, 48)[1:]:
+        depth = load_truth(clip / "truth", camera.name, 0).depth
+        pixels, z = camera.project(points)
+        column, row = np.floor(np.clip(pixels, 0, (63, 47))).astype(int).T
+        distances.append(np.abs(z - depth[row, column]) * camera.K[0, 0] / z)
+    # Half a pixel of noise, and a surface that may slope by up to a pixel's width.
+    median, most = np.percentile(np.min(distances, axis=0), (50, 95))
+    assert median < 1
+    assert most < 4
+
+
+@pytest.mark.slow
+def test_synthesize__replaces_a_capture_with_overwrite_and_no_other_files(tmp_path, clip):
+    (tmp_path / ".git").mkdir()
+    (tmp_path / "new" / "__MACOSX").mkdir(parents=True)
+    with pytest.raises(FileExistsError, match="not empty; choose another folder"):
+        synthesize("spheres", tmp_path, TINY)
+    # The last belongs to a fit; a recording may have one too.
+    for content in (None, "{", "[]", '{"layout": "COLMAP"}'):
+        if content is not None:
+            (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(FileExistsError, match="is not a synthetic capture"):
+            synthesize("spheres", tmp_path, TINY, overwrite=True)
+    (tmp_path / "capture.json").unlink()
+    synthesize("spheres", tmp_path / "new", replace(TINY, lossless=False))
+    assert not (tmp_path / "new" / "frames").exists()
+    assert load_capture(tmp_path / "new").num_frames == 1
+    out = shutil.copytree(clip, tmp_path / "clip")
+    counts = []
+    synthesize("spheres", out, TINY, overwrite=True, progress=lambda *count: counts.append(count))
+    assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
+    assert not (out / "cam02.mp4").exists()
+    assert counts == [(1, 2), (2, 2)]
+    with pytest.raises(
+        ValueError, match=f"expected an output outside of captures, .* in the capture {out}"
+    ):
+        synthesize("spheres", out / "clip", TINY)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".git", "clip", "new"]
+
+
+@pytest.mark.slow
+def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("morgs_mi.extras.synth.synthesize.write_colmap", full)
+    with pytest.raises(
+        OSError, match=r"cannot write .*the partial output was removed.*No space left"
+    ):
+        synthesize("spheres", tmp_path / "clip", TINY)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cameras": 1}, "`cameras` must be at least 2, got 1"),
+        ({"width": 63}, "`width` must be at least 2 and a multiple of 2, got 63"),
+        ({"disturbances": Disturbances(rolling_shutter=1.5)}, "`rolling_shutter` must be at least"),
+    ],
+)
+def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        synthesize("spheres", tmp_path / "clip", SynthConfig(**settings))
+
+
+def test_synthesize__names_the_scenes(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'"
+    ):
+        synthesize("nowhere", tmp_path / "clip")
+
+
+def sphere(**entries):
+    return {"type": "sphere", "bsdf": textured(np.full((2, 2, 3), 0.5, np.float32)), **entries}
+
+
+def bitmap(file):
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": file}}
+
+
+BALL = {"ball": Object({"ball": sphere()})}
+WRONG_SCENES = {
+    "mesh": (
+        {"fox": Object({"body": {"type": "ply", "filename": "no.ply"}})},
+        {},
+        '"fox_body": .*"no.ply": file not found',
+    ),
+    "path": (
+        {"a": Object({"b": sphere(bsdf=bitmap(Path(__file__)))})},
+        {},
+        "could not assign an object of type 'pathlib.PosixPath' to key 'filename'",
+    ),
+    "image": (
+        {"a": Object({"b": sphere(bsdf=bitmap(__file__))})},
+        lights(),
+        'scene .mine.: Mitsuba cannot load it: .*"a_b.bsdf.reflectance"',
+    ),
+    "none": (
+        {"a": Object({"b": sphere(radius=None)})},
+        {},
+        "object 'a', b: `radius` must have a value, got None",
+    ),
+    "no object": (
+        {"a": sphere()},
+        {},
+        "object 'a': `it` must be a .*Object, got a dict",
+    ),
+    "names": (
+        {"lamp": Object({"a": sphere()}, lambda t: np.eye(4))},
+        lights(),
+        r"light 'lamp': its names in Mitsuba must be its own, got \['lamp'\] twice",
+    ),
+    "later": (
+        {"a": Object({"b": sphere()}, lambda t: np.diag([1 + t, 1, 1, 1]))},
+        {},
+        "its pose at 0.03333 s is not rigid: .*undo any scaling",
+    ),
+    "nan": (
+        {"a": Object({"b": sphere()}, lambda t: np.nan * np.eye(4))},
+        {},
+        "its pose at 0 s is not rigid: the pose must be finite",
+    ),
+    "pose fails": (
+        {"a": Object({"b": sphere()}, lambda t: {}["hinge"])},
+        {},
+        "object 'a': its pose at 0 s fails with KeyError: 'hinge'",
+    ),
+    "lamp pose": (
+        BALL,
+        {"p": Light({"type": "point"}, lambda t: np.eye(4))},
+        "a lamp with a pose must be a shape",
+    ),
+    "black": (BALL, {}, "expected an emitter, got none, for black images; give it lights"),
+    "nothing": ({}, lights(), "cam00 must see an object at 0 s, got none; move the objects"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SCENES)
+def test_synthesize__refuses_a_wrong_scene_before_rendering(tmp_path, case):
+    objects, lamps, message = WRONG_SCENES[case]
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        synthesize(Scene("mine", objects, lamps), tmp_path / "clip", TINY)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_synthesize__warns_of_black_images(tmp_path, caplog):
+    dark = Light({"type": "point", "position": [0, 0, 0]})
+    synthesize(
+        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}),
+        tmp_path / "clip",
+        TINY,
+    )
+    assert "scene 'mine': cam00 is black at 0 s: no lamp reaches" in caplog.text
+
+
+def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames(clip):
+    video = cv2.VideoCapture(str(clip / "cam01.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little") == b"VP90"
+    played, stored = (open_frames(clip / name).frames() for name in ("cam01.mp4", "frames/cam01"))
+    assert min(psnr(*pair) for pair in zip(played, stored, strict=True)) > 25
