@@ -1,5 +1,5 @@
 """The Mitsuba integrators of this package: `gaussian_splat`, which renders the Gaussians of a scene
-by rasterisation, and `splat_path` (see `studio.light`).
+by rasterisation, and `splat_path` (see `extras.light`).
 
     "integrator": {"type": "gaussian_splat", "aovs": "motion,depth"}
 
@@ -39,14 +39,14 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.attributes import shape_attribute_widths
-from morgs_mi.core.entries import place_of
+from morgs_mi.core.extras import places
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy, owned_copy
 
 # The class of each plugin, MODULE:NAME.
 _PLUGINS = {
     "gaussian_splat": "morgs_mi.surfaces.gaussian_splat:GaussianSplatIntegrator",
-    "splat_path": place_of("integrators", "splat_path"),
+    **places("integrators"),
 }
 
 

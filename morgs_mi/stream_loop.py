@@ -22,7 +22,7 @@ import numpy as np
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.entries import STUDIO, studio_entry
+from morgs_mi.core.extras import extra, places
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.memory import process_memory, release_memory
@@ -290,9 +290,9 @@ class StreamLoop:
             observation = observe_frame(self.setup, frame, previous, images)
         history = observation.history
         if not frame and self._can_mistake_order and not isinstance(images, Mapping):
-            for name in STUDIO["image checks"]:
+            for name in places("image checks"):
                 views = views_of(self.setup, history.images)
-                for problem in studio_entry("image checks", name)(views):
+                for problem in extra("image checks", name)(views):
                     _LOG.warning("frame 0: %s", problem)
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)

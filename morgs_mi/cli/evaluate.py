@@ -39,8 +39,8 @@ class Eval:
     """
 
     def run(self) -> None:
-        from morgs_mi.core.entries import studio_entry
         from morgs_mi.core.environment import machine, versions
+        from morgs_mi.core.extras import extra
         from morgs_mi.core.files import json_finite, write_json
         from morgs_mi.evaluate.evaluate import evaluate_stream
         from morgs_mi.evaluate.figures import draw_stream
@@ -58,7 +58,7 @@ class Eval:
                 )
         network = None
         if self.lpips is not None:
-            network = studio_entry("image distances", "lpips")(self.lpips)
+            network = extra("image distances", "lpips")(self.lpips)
         with progress() as report:
             frames = partial(report, "Evaluating frames")
             result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)

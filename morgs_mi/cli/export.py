@@ -21,7 +21,7 @@ from morgs_mi.cli.streams import (
     shown_exposure,
 )
 from morgs_mi.core.documentation import page
-from morgs_mi.core.entries import studio_entry
+from morgs_mi.core.extras import extra, places
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
 
@@ -141,10 +141,9 @@ class Web(ExportKind):
 # The class of each kind, in the order of the help.
 EXPORTS: Mapping[str, type[ExportKind]] = {
     "ply": Ply,
-    "gltf": studio_entry("exports", "gltf"),
-    "usd": studio_entry("exports", "usd"),
     "video": Flight,
     "web": Web,
+    **{name: extra("exports", name) for name in places("exports")},
 }
 
 

@@ -1,7 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`,
-`accuracy`, `sweep` and `demo`.
+`morgs-mi fit`, `render`, `export`, `view`, `eval`, `accuracy`, and the commands of extras.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the
 user can correct is one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status
@@ -40,26 +39,20 @@ from morgs_mi.cli.fit import Fit
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import Flag, Settings, one_command
 from morgs_mi.cli.view import View
-from morgs_mi.core.entries import studio_entry
+from morgs_mi.core.extras import extra, places
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
 # Exit status of a shell for a program whose reader has ended, such as `head`.
 _CLOSED = 141
 # The class of each command, in the order of the help: a dataclass of its options, with `run`.
 COMMANDS: Mapping[str, type] = {
-    "synth": studio_entry("commands", "synth"),
-    "info": studio_entry("commands", "info"),
-    "calibrate": studio_entry("commands", "calibrate"),
     "fit": Fit,
-    "live": studio_entry("commands", "live"),
     "render": Render,
     "export": Export,
-    "import": studio_entry("commands", "import"),
     "view": View,
     "eval": Eval,
     "accuracy": Accuracy,
-    "sweep": studio_entry("commands", "sweep"),
-    "demo": studio_entry("commands", "demo"),
+    **{name: extra("commands", name) for name in places("commands")},
 }
 
 

@@ -13,7 +13,7 @@ from morgs_mi.cli.console import print_result, progress, quantity
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional
 from morgs_mi.cli.streams import DropInvalid, opened, shown_exposure
 from morgs_mi.core.documentation import page
-from morgs_mi.core.entries import studio_entry
+from morgs_mi.core.extras import extra
 from morgs_mi.playback.export.formats import IMAGES, destination
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ class Render:
         from morgs_mi.playback.export.clips import frame_numbers
 
         assert self.insert is not None
-        insert = studio_entry("renderings", "insert")
+        insert = extra("renderings", "insert")
         view = view if self.width is None else view.with_width(self.width)
         frames = frame_numbers(stream) if self.at is None else insert.selected(stream, self.at)
         channels = self.channels or ("color",)

@@ -1,1 +1,1 @@
-"""Wings that some users need; nothing outside of this subpackage imports it, see `core.entries`."""
+"""What some users need. Each folder can be deleted; it enters itself by `core.extras`."""

@@ -14,7 +14,7 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.points import dense_points, match_capture
 from morgs_mi.codec.container import Packet
-from morgs_mi.core.entries import studio_entry
+from morgs_mi.core.extras import extra
 from morgs_mi.core.files import locked_folder
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
@@ -163,7 +163,7 @@ class Prepared:
         if config.fit.refine_cameras == "off":
             return cls(capture)
         stage = progress.of("Refining cameras")
-        refine_cameras = studio_entry("camera refinement", "first frame")
+        refine_cameras = extra("camera refinement", "first frame")
         return cls(*refine_cameras(capture, config.fit, config.render, config.seed, stage))
 
     @property

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
@@ -354,7 +354,7 @@ def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(
     path = layouts.n3dv(tmp_path / "capture")
     (path / "cam02.mkv").unlink()
     old_files = sorted(tmp_path.rglob("*"))
-    assert cli.main(["fit", str(path), str(tmp_path / "out")]) == 1
+    assert main(["fit", str(path), str(tmp_path / "out")]) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip("━ ")]
     assert "expected one row per camera, got 3 rows for 2 videos" in line
     assert sorted(tmp_path.rglob("*")) == old_files

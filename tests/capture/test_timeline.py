@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
@@ -286,7 +286,7 @@ def test_info_command__reports_a_variable_frame_rate(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
-    assert cli.main(["info", str(path), "--no-check", "--trim"]) == 0
+    assert main(["info", str(path), "--no-check", "--trim"]) == 0
     assert "b.mp4: variable frame rate, 5 frames in 7 periods" in capsys.readouterr().out
 
 

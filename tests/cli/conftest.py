@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from tests.scenes import noise_capture
@@ -19,7 +19,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
     """`morgs-mi` with arguments; returns its status, standard output and standard error."""
 
     def call(*args: object) -> tuple[int, str, str]:
-        status = cli.main([str(a) for a in args])
+        status = main([str(a) for a in args])
         captured = capsys.readouterr()
         return status, captured.out, captured.err
 

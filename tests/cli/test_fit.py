@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.reader import StreamReader
@@ -159,7 +159,7 @@ def test_fit__rejects_bad_input_in_one_sentence(capture, tmp_path, run, args, pa
 
 def test_fit__rejects_arguments_that_cannot_be_parsed(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["fit", str(tmp_path), str(tmp_path / "out"), "--epochs", "many"])
+        main(["fit", str(tmp_path), str(tmp_path / "out"), "--epochs", "many"])
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
@@ -274,7 +274,7 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture, tmp_path):
         "        resource.setrlimit(resource.RLIMIT_FSIZE, (writer.num_bytes + 9,) * 2)\n"
         "    return write(writer, packet)\n"
         "container.StreamWriter.write = limited\n"
-        "sys.exit(cli.main(sys.argv[1:]))\n"
+        "sys.exit(main(sys.argv[1:]))\n"
     )
     args = [sys.executable, "-c", script, "fit", str(capture), str(tmp_path / "out"), *OPTIONS]
     result = subprocess.run(args, capture_output=True, text=True, check=False)

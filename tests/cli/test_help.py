@@ -9,8 +9,8 @@ from importlib.metadata import version
 from typing import get_args
 
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.loop.stream_config import PresetName
 
 
@@ -35,25 +35,25 @@ def test_main__ends_silently_if_the_reader_of_its_output_has():
 
 def test_main__writes_the_completion_of_a_shell(tmp_path):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["--tyro-write-completion", "bash", str(tmp_path / "morgs-mi.bash")])
+        main(["--tyro-write-completion", "bash", str(tmp_path / "morgs-mi.bash")])
     assert not stop.value.code
     assert "morgs-mi" in (tmp_path / "morgs-mi.bash").read_text()
 
 
 @pytest.mark.parametrize(
     ("words", "commands"),
-    [(["export", "plly", "out"], "ply, gltf, usd")],
+    [(["export", "plly", "out"], "ply, video, web, gltf, usd")],
 )
 def test_main__lists_the_commands_in_place_of_a_mistyped_one(words, commands, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(words)
+        main(words)
     assert stop.value.code == 2
     assert commands in capsys.readouterr().err
 
 
 def test_fit__lists_all_presets_in_its_help(capsys):
     with pytest.raises(SystemExit):
-        cli.main(["fit", "--help"])
+        main(["fit", "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     shown = text.partition("--preset NAME")[2].partition("--config")[0].replace(",", " ").split()
     assert set(get_args(PresetName)) <= set(shown)

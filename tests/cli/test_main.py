@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.codec.container import StreamWriter
 from tests.cli.commands import assert_one_sentence, assert_refused
 from tests.core.test_files import tree
@@ -79,7 +79,7 @@ EXPORTS = ("ply", "gltf", "usd", "video", "web")
 )
 def test_main__has_at_most_30_options_per_command(command, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main([*command, "--help"])
+        main([*command, "--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     options = re.findall(r"^[│ ] (?:-\w, )?(--[\w.-]+|\[?[A-Z]+\]?)[, ]", text, re.MULTILINE)

@@ -9,8 +9,8 @@ from functools import reduce
 from typing import Any, get_type_hints
 
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.core.config import apply_values, config_toml
@@ -100,7 +100,7 @@ def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 @pytest.mark.parametrize(("command", "config"), [("fit", StreamConfig()), ("live", LIVE_STREAM)])
 def test_help__shows_the_defaults_of_the_options(command, config, capsys):
     with pytest.raises(SystemExit):
-        cli.main([command, "--help"])
+        main([command, "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for option, key in SETTINGS.items():
         default = reduce(getattr, key.split("."), config)
@@ -126,7 +126,7 @@ def test_Reading__has_the_fields_of_the_config():
 )
 def test_offset__refuses_what_is_no_pair(words, sentence, capsys):
     with pytest.raises(SystemExit):
-        cli.main(["info", "capture", "--offset", *words])
+        main(["info", "capture", "--offset", *words])
     captured = capsys.readouterr()
     assert sentence in " ".join((captured.out + captured.err).replace("│", " ").split())
 
@@ -134,7 +134,7 @@ def test_offset__refuses_what_is_no_pair(words, sentence, capsys):
 @pytest.mark.parametrize("option", ["--preset", "--refine-cameras", "--exposure"])
 def test_fit__lists_the_choices_of_an_option_without_none(option, capsys):
     with pytest.raises(SystemExit):
-        cli.main(["fit", "capture", "out", option, "maybe"])
+        main(["fit", "capture", "out", option, "maybe"])
     captured = capsys.readouterr()
     printed = captured.out + captured.err
     assert "maybe" in printed

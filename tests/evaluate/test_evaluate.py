@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.layouts.colmap import write_colmap
@@ -71,7 +71,7 @@ def test_evaluate_stream__names_frames_that_were_fitted_without_images(fitted_cl
     rows[1]["missing_views"] = ["cam1"]
     report.write_text(json.dumps({"frames": rows}))
     try:
-        assert cli.main(["eval", str(fitted_clip)]) == 0
+        assert main(["eval", str(fitted_clip)]) == 0
     finally:
         report.write_text(text)
     assert "frames 1 were fitted without any image" in capsys.readouterr().err

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 from scipy.spatial import KDTree
 
-from morgs_mi import cli
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import play
@@ -243,7 +243,7 @@ def test_import_frames__leaves_out_invalid_gaussians_if_asked_to(tmp_path, caplo
     clip = write_frames(tmp_path / "clip", frames)
     with pytest.raises(ValueError, match=r"frame1\.ply: .* in 2 of 300 Gaussians .*--drop-invalid"):
         import_frames([clip], tmp_path / "s.morgs")
-    assert cli.main(["import", str(clip), str(tmp_path / "s.morgs"), "--drop-invalid"]) == 0
+    assert main(["import", str(clip), str(tmp_path / "s.morgs"), "--drop-invalid"]) == 0
     counts = [len(gaussians) for _, gaussians in play(StreamReader(tmp_path / "s.morgs"))]
     assert counts == [N, N - 2, N]
     assert "frame1.ply: 2 of 300 Gaussians are left out" in caplog.text

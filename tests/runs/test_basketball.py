@@ -15,8 +15,8 @@ import shutil
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 
 FOLDER = os.environ.get("MORGS_MI_BASKETBALL")
@@ -38,8 +38,8 @@ def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
         "--epochs",
         "2",
     ]
-    assert cli.main(command) == 0
-    assert cli.main(["eval", str(out), "--json", str(tmp_path / "eval.json")]) == 0
+    assert main(command) == 0
+    assert main(["eval", str(out), "--json", str(tmp_path / "eval.json")]) == 0
     result = json.loads((tmp_path / "eval.json").read_text())
     assert set(result["views"]) == {"0", "10", "15", "30"}
     # The committed run, docs/experiments/real.md, less the spread of fits.
@@ -57,7 +57,7 @@ def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
     shutil.copytree(out, tmp_path / "cut")
     (tmp_path / "cut" / "stream.morgs").write_bytes(whole[: offset + 100])
     assert (
-        cli.main(
+        main(
             [*(str(tmp_path / "cut") if part == str(out) else part for part in command), "--resume"]
         )
         == 0

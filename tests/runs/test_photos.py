@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
 from benchmarks.pages.results import committed
 from benchmarks.reports import real
-from morgs_mi import cli
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.
@@ -42,7 +42,7 @@ def test_photos__are_calibrated_and_reach_the_committed_quality(name, tmp_path):
     for path in sorted((Path(FOLDER or ".") / name).iterdir()):
         if path.suffix.lower() in (".jpg", ".png"):
             shutil.copy(path, photos)
-    assert cli.main(["calibrate", str(photos), "--shared-intrinsics"]) == 0
+    assert main(["calibrate", str(photos), "--shared-intrinsics"]) == 0
     real.Options(json=tmp_path / "out.json", captures=(photos,)).run()
     (row,) = json.loads((tmp_path / "out.json").read_text())["fits"]
     assert row["views"] + row["held_out_views"] == count, "every photo is registered"

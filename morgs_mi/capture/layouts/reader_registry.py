@@ -1,6 +1,7 @@
 """Readers of the supported capture layouts.
 
-A module of this folder exposes its `READER`; one outside of this package appends it to `READERS`.
+A module of this folder exposes its `READER`. Extras enter theirs; a script appends its own to
+`READERS`.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
 from morgs_mi.capture.layouts.calibration import Reader, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.entries import STUDIO, studio_entry
+from morgs_mi.core.extras import extra, places
 from morgs_mi.core.fit_names import CAPTURE, STREAM
 
 READERS: list[Reader] = [
     colmap.READER,
     nerfstudio.READER,
-    *(studio_entry("layouts", name) for name in STUDIO["layouts"]),
+    *(extra("layouts", name) for name in places("layouts")),
     poses_bounds.READER,
 ]
 """The readers in order of precedence, for folders with several calibrations. COLMAP's is the most

@@ -1,1 +1,8 @@
-"""Exports to OpenUSD and glTF."""
+"""glTF and OpenUSD files of a stream."""
+
+from morgs_mi.core.extras import enter
+
+
+def register() -> None:
+    """Enter what this extra adds to the package."""
+    enter(__name__, "exports", {"gltf": "commands:Gltf", "usd": "commands:Usd"})

@@ -1,0 +1,8 @@
+"""Streams from the files of other tools."""
+
+from morgs_mi.core.extras import enter
+
+
+def register() -> None:
+    """Enter what this extra adds to the package."""
+    enter(__name__, "commands", {"import": "command:Import"})

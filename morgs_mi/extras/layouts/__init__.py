@@ -1,1 +1,16 @@
-"""Capture layouts of motion capture systems and of Dynamic 3D Gaussians."""
+"""Further layouts of captures."""
+
+from morgs_mi.core.extras import enter
+
+
+def register() -> None:
+    """Enter what this extra adds to the package."""
+    enter(
+        __name__,
+        "layouts",
+        {
+            "dynamic3dgs": "dynamic3dgs:READER",
+            "qualisys": "qualisys:READER",
+            "anipose": "anipose:READER",
+        },
+    )

@@ -1,3 +1,8 @@
-"""Live cameras: fits of the newest synchronous images, calibrated once, and frames for a loop of
-one's own.
-"""
+"""Fits of what cameras record at this moment."""
+
+from morgs_mi.core.extras import enter
+
+
+def register() -> None:
+    """Enter what this extra adds to the package."""
+    enter(__name__, "commands", {"live": "command:Live"})

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
 from morgs_mi.capture.points import match_capture
@@ -65,7 +65,7 @@ def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
 def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     cameras = textured.rig(6, 240, 180)
     film(tmp_path, cameras)
-    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert "sparse/0: 6 cameras, " in capsys.readouterr().out
     capture = load_capture(tmp_path)
     assert capture.names == tuple(camera.name for camera in cameras)
@@ -79,7 +79,7 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
         assert_close(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
         np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
     assert check_rig(capture, match_capture(capture)).fits
-    status = cli.main(["calibrate", str(tmp_path)])
+    status = main(["calibrate", str(tmp_path)])
     assert status == 1
     assert "sparse: expected no model, got one" in capsys.readouterr().err
 
@@ -141,7 +141,7 @@ def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -
     for camera, shift in zip(cameras, np.random.default_rng(0).uniform(-6, 6, (6, 2)), strict=True):
         camera.K[:2, 2] += shift
     film(tmp_path, cameras)
-    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert "with a principal point for each" in " ".join(capsys.readouterr().out.split())
     positions, true = (
         np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras)
@@ -156,7 +156,7 @@ def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
 ) -> None:
     film(tmp_path, textured.rig(6, 240, 180))
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: {})
-    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert re.search(r"6 cameras, .* by\s+global\s+mapping", capsys.readouterr().out)
     monkeypatch.setattr(pycolmap, "global_mapping", lambda *_: {})
     with pytest.raises(
@@ -216,7 +216,7 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
     film(tmp_path, cameras)
     shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
     write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
-    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
+    assert main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
     printed = capsys.readouterr()
     rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
     assert re.match(r"\d{3} +0\.\d\d +fits", rows["cam0"])

@@ -33,4 +33,4 @@ def test_import_pycolmap__keeps_the_handler_of_sigterm():
 def test_import_pycolmap__is_called_by_the_calibration_alone():
     package = Path(morgs_mi.__file__).parent
     users = [path for path in package.rglob("*.py") if "pycolmap()" in path.read_text("utf-8")]
-    assert {path.parent for path in users} == {package / "studio/calibration"}
+    assert {path.parent for path in users} == {package / "extras/calibration"}

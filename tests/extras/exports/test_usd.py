@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import CodedFrame, keyframe_packet
 from morgs_mi.codec.reader import StreamReader
@@ -176,13 +176,11 @@ def test_write_usd__begins_a_prim_for_a_new_set_of_gaussians(tmp_path):
 
 def test_export_usd__writes_selected_frames(tmp_path, capsys):
     write_stream(tmp_path / "stream.morgs")
-    assert (
-        cli.main(["export", "usd", str(tmp_path), str(tmp_path / "a.usda"), "--frames", "1:3"]) == 0
-    )
+    assert main(["export", "usd", str(tmp_path), str(tmp_path / "a.usda"), "--frames", "1:3"]) == 0
     assert capsys.readouterr().out.startswith(f"{tmp_path}/a.usda: 2 frames, ")
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1, 2)
-    assert cli.main(["export", "usd", str(tmp_path)]) == 0
+    assert main(["export", "usd", str(tmp_path)]) == 0
     assert (tmp_path / "stream.usdc").is_file()
 
 
@@ -190,7 +188,7 @@ def test_export_usd__writes_selected_frames(tmp_path, capsys):
 def test_export_usd__removes_its_output_on_a_full_disk(tmp_path, capfd, suffix):
     write_stream(tmp_path / "stream.morgs")
     with files_end_at(3000):
-        status = cli.main(["export", "usd", str(tmp_path), str(tmp_path / f"a{suffix}")])
+        status = main(["export", "usd", str(tmp_path), str(tmp_path / f"a{suffix}")])
     error = capfd.readouterr().err
     assert status == 1
     # A package is made in another folder first.

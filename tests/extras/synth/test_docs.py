@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.extras.synth.synth_config import SynthConfig
@@ -41,7 +41,7 @@ def test_scenes_page__commands_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
-    assert cli.main([*command, *SMALL]) == 0
+    assert main([*command, *SMALL]) == 0
     drawn = load_disturbances(Path(command[2]) / "truth").values()
     for field in fields(Disturbances):
         option = f"--{field.name.replace('_', '-')}"

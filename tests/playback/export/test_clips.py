@@ -8,8 +8,8 @@ import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.ply import read_ply
@@ -35,7 +35,7 @@ def stream(tmp_path):
 
 
 def run(*args: object) -> int:
-    return cli.main([str(arg) for arg in args])
+    return main([str(arg) for arg in args])
 
 
 def test_export_ply__writes_every_frame(stream, tmp_path):

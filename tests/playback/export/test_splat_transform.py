@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from morgs_mi.io.ply import read_ply, write_ply
@@ -96,7 +96,7 @@ def test_read_splats__agrees_with_splat_transform_on_a_splat_file(program, tmp_p
 @pytest.mark.parametrize(("command", "suffix"), [*zip(COMMANDS, (".sog", ".spz"), strict=True)])
 def test_exports_page__commands_convert_every_frame(program, tmp_path, command, suffix):
     write_stream(tmp_path / "stream.morgs", 2)
-    assert cli.main(["export", "ply", str(tmp_path)]) == 0
+    assert main(["export", "ply", str(tmp_path)]) == 0
     subprocess.run(["bash", "-c", command.replace("OUT", str(tmp_path))], check=True, timeout=300)
     assert len(list((tmp_path / "ply").glob(f"*{suffix}"))) == 2
     convert(program, tmp_path / "ply" / f"0001{suffix}", tmp_path / "back.ply")

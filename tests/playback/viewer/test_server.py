@@ -19,9 +19,9 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+from morgs_mi.cli.main import main
 from starlette.datastructures import Headers
 
-from morgs_mi import cli
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
@@ -519,7 +519,7 @@ def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, link, 
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr(Viewer, "run", lambda viewer: viewer.close())
-    assert cli.main(["view", str(clip[0]), *args]) == 0
+    assert main(["view", str(clip[0]), *args]) == 0
     output = " ".join(capsys.readouterr().out.split())
     url = re.search(link, output)
     assert url is not None
@@ -531,7 +531,7 @@ def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, link, 
 def test_view__refuses_a_port_that_is_taken(clip, capsys):
     with socket.create_server(("127.0.0.1", 0)) as socket_in_use:
         port = socket_in_use.getsockname()[1]
-        assert cli.main(["view", str(clip[0]), "--port", str(port), "--no-browser"]) == 1
+        assert main(["view", str(clip[0]), "--port", str(port), "--no-browser"]) == 1
     assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(
         capsys.readouterr().err.split()
     )

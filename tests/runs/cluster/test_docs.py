@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from morgs_mi.cli.main import main
 
-from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording
@@ -61,7 +61,7 @@ def test_cluster_page__commands_run(workplace):
             else:
                 program, *args = shlex.split(command)
                 assert program == "morgs-mi"
-                assert cli.main([*args, *(OPTIONS if args[0] == "fit" else [])]) == 0, command
+                assert main([*args, *(OPTIONS if args[0] == "fit" else [])]) == 0, command
     streams = sorted(
         str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs")
     )
