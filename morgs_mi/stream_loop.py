@@ -9,7 +9,6 @@ from the decoded packet.
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
@@ -230,7 +229,7 @@ class StreamLoop:
         self.state = StreamState()
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
-        self._resident = 0.0  # bytes, of the frame after memory was last released
+        self._resident = 0  # bytes, above which memory is released
         # Whether images in a list may be in another order than the cameras.
         self._can_mistake_order = True
 
@@ -308,11 +307,11 @@ class StreamLoop:
         # Buffers for more active Gaussians have a new size, and the smaller ones stay allocated.
         # The buffers of the first frame are not used again.
         if resident > _GROWTH * self._resident:
+            self._resident = resident if frame else 0
             release_memory()
             memory = process_memory()
-            self._resident = math.inf
-        elif self._resident == math.inf:
-            self._resident = resident  # with the buffers that a frame takes
+        else:
+            self._resident = min(self._resident, resident)
         return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)
 
     def _observation_ahead(self, images: Frame) -> FrameObservation | None:

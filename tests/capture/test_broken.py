@@ -9,10 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cli.main import main
 from morgs_mi.io.video_writer import write_video
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cli.main import main
 from morgs_mi.io.video_writer import write_video
 from tests.scenes import captures as layouts
 

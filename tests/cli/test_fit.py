@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.io.video import VideoReader

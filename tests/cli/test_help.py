@@ -9,8 +9,8 @@ from importlib.metadata import version
 from typing import get_args
 
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.loop.stream_config import PresetName
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from tests.cli.commands import assert_one_sentence, assert_refused
 from tests.core.test_files import tree

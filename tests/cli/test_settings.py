@@ -9,9 +9,9 @@ from functools import reduce
 from typing import Any, get_type_hints
 
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cli.main import main
 from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.core.config import apply_values, config_toml
 from morgs_mi.extras.live.live_config import LIVE_STREAM

@@ -90,7 +90,7 @@ def wide(width: int) -> Camera:
 
 
 DOORS = {
-    "image": (lambda: rasterize(splats(), wide(16000)), "an image of 16000x16000 pixels"),
+    "image": (lambda: rasterize(splats(), wide(16000)), "1 x 16000x16000 pixels"),
     "gaussians": (
         lambda: StreamLoop([wide(8)], (), (), StreamConfig(fit=FitConfig(num_gaussians=10**9))),
         "`num_gaussians=1000000000`",

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image

@@ -15,8 +15,8 @@ import shutil
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 
 FOLDER = os.environ.get("MORGS_MI_BASKETBALL")

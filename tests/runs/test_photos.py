@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
 from benchmarks.pages.results import committed
 from benchmarks.reports import real
+from morgs_mi.cli.main import main
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.

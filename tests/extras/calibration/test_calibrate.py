@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
 from morgs_mi.capture.points import match_capture
+from morgs_mi.cli.main import main
 from morgs_mi.core.camera import Camera
 from morgs_mi.extras.calibration.calibrate import (
     _DATABASE,

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import CodedFrame, keyframe_packet
 from morgs_mi.codec.reader import StreamReader

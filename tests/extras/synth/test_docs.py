@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
 from morgs_mi.capture.truth import load_truth
+from morgs_mi.cli.main import main
 from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize

@@ -8,8 +8,8 @@ import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.ply import read_ply

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from morgs_mi.io.ply import read_ply, write_ply

@@ -19,10 +19,10 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 from starlette.datastructures import Headers
 
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.fit_names import PROVISIONAL

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from morgs_mi.cli.main import main
 
+from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording

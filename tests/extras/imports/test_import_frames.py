@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from morgs_mi.cli.main import main
 from scipy.spatial import KDTree
 
+from morgs_mi.cli.main import main
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import play

@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from morgs_mi.extras.commands import captures as info
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.extras.calibration import command as info
 from morgs_mi.extras.calibration.timing import TimeOffsets
 from morgs_mi.io.video_writer import write_video
 from tests.cli.commands import assert_refused

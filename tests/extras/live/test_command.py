@@ -7,9 +7,9 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from morgs_mi.extras.commands import live as module
 
 from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.extras.live import command as module
 from morgs_mi.extras.live.command import Live, LiveSettings, _Lines, _summary
 from morgs_mi.extras.live.fit_live import LiveFrame
 from morgs_mi.io.video_writer import write_video

@@ -15,7 +15,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.config import apply_values, config_toml, read_config
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import ViewScores
-from morgs_mi.extras import sweep as module
+from morgs_mi.extras.sweep import sweep as module
 from morgs_mi.extras.sweep.plot import draw_curves
 from morgs_mi.extras.sweep.sweep import PARTS, TITLES, SweepResult, leave_out, sweep
 from morgs_mi.fit.fit_config import DensityConfig
