@@ -29,10 +29,6 @@ class Eval:
     """Compare with CAPTURE even if it is another recording by the same cameras."""
     json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
     """File for all results; - prints them instead of the tables."""
-    figures: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
-    """Folder for slice.png (one column over time), motion.png, confidence.png, and offset.png if it
-    is stored.
-    """
     lpips: Annotated[Path | None, DisallowNone, optional("FILE.onnx")] = None
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package
     includes none.
@@ -43,28 +39,22 @@ class Eval:
         from morgs_mi.core.extras import extra
         from morgs_mi.core.files import json_finite, write_json
         from morgs_mi.evaluate.evaluate import evaluate_stream
-        from morgs_mi.evaluate.figures import draw_stream
         from morgs_mi.playback.streams import spans
 
         folder = self.out if self.out.is_dir() else self.out.parent
         files_of_fit = [path.resolve() for path in (self.out, *(folder / name for name in FILES))]
-        for output in (self.figures, self.json):
-            if output in (None, Path("-")):
-                continue
-            if check_output(output).resolve() in files_of_fit:
-                raise ValueError(
-                    f"{output}: expected a new file, got one that the fit has written; choose "
-                    "another name."
-                )
+        output = None if self.json == Path("-") else self.json
+        if output is not None and check_output(output).resolve() in files_of_fit:
+            raise ValueError(
+                f"{output}: expected a new file, got one that the fit has written; choose another "
+                "name."
+            )
         network = None
         if self.lpips is not None:
             network = extra("image distances", "lpips")(self.lpips)
         with progress() as report:
             frames = partial(report, "Evaluating frames")
             result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
-            if self.figures is not None:
-                drawing = partial(report, "Drawing frames")
-                draw_stream(self.out, self.figures, self.capture, drawing, self.any_recording)
         scores = {**result.as_dict(), "machine": machine(), "versions": versions()}
         if self.json == Path("-"):
             print_result(json.dumps(json_finite(scores), indent=2))
@@ -83,8 +73,6 @@ class Eval:
                 f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} "
                 "frames."
             )
-        if self.json is not None:
-            write_json(self.json, scores)
-            print_result(f"All results: {self.json}")
-        if self.figures is not None:
-            print_result(f"Figures: {self.figures}")
+        if output is not None:
+            write_json(output, scores)
+            print_result(f"All results: {output}")

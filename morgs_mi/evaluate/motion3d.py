@@ -5,10 +5,8 @@ surface on which it lay at t-1:
 
 1. A Gaussian lies on the surface of object k if, in some view at t-1, the pixel under its centre
    shows k within 1 % of the centre's depth, and the same holds for no other object in any view.
-2. The motion of a rigid object is the rigid motion that best maps its tracked points from t-1 to t,
-   exact up to rounding. Another object deforms: the motion around a Gaussian is the rigid one that
-   best maps the eight nearest tracked points, and the Gaussian is excluded where they leave more
-   than a tenth of its displacement.
+2. The motion of an object is the rigid motion that best maps its tracked points from t-1 to t,
+   exact up to rounding. Objects that deform are excluded.
 3. Gaussians are evaluated if their opacity is at least 0.1 and their d* is at least a tenth of the
    longest on their object: the others are hardly visible or have no meaningful direction.
 
@@ -20,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
@@ -34,10 +31,6 @@ _LEAST_SHARE = 0.1
 # one line.
 _RIGID = 1e-4
 _FLAT = 1e-3
-# Tracked points around a Gaussian on a deforming object, and how much of the displacement they may
-# leave.
-_NEIGHBOURS = 8
-_LEAST_AGREEMENT = 0.1
 
 
 def evaluate_motion(
@@ -61,43 +54,14 @@ def evaluate_motion(
     rigid = rigid_motions(*tracks)
     true = np.zeros_like(means, float)
     mask = np.zeros(len(means), bool)
-    for index in np.unique(tracks[2]):
+    for index in rigid:
         starts, ends = (points[tracks[2] == index] for points in tracks[:2])
         longest = np.linalg.norm(ends - starts, axis=-1).max()
         on = (ids == index) & (opacities >= _LEAST_OPACITY)
-        if not longest:
-            continue
-        if index in rigid:
-            rotation, shift = rigid[index]
-            true[on] = means[on] @ (rotation - np.eye(3)).T + shift
-        else:
-            true[on] = local_motion(means[on], starts, ends)
+        rotation, shift = rigid[index]
+        true[on] = means[on] @ (rotation - np.eye(3)).T + shift
         mask |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
     return compare_motion(displacements[mask], true[mask])
-
-
-def local_motion(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return the displacement of points [M, 3] on a deforming object, NaN where the tracks around
-    one disagree.
-
-    Args:
-        points: at the earlier time, world units.
-        starts: tracked points of the object at that time [P, 3].
-        ends: the same points one frame later.
-    """
-    if len(starts) < _NEIGHBOURS:
-        return np.full_like(points, np.nan)
-    _, nearest = KDTree(starts).query(points, k=_NEIGHBOURS)
-    p = starts[nearest]
-    q = ends[nearest]
-    center = p.mean(axis=1, keepdims=True)
-    target = q.mean(axis=1, keepdims=True)
-    turn = _rotation(p - center, q - target)
-    distances = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1)
-    residuals = distances.max(axis=-1)
-    displacements = np.einsum("mij,mj->mi", turn, points - center[:, 0]) + target[:, 0] - points
-    displacements[residuals > _LEAST_AGREEMENT * np.linalg.norm(displacements, axis=-1)] = np.nan
-    return displacements
 
 
 def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:

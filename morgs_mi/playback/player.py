@@ -8,13 +8,12 @@ displacement.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 
-from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
@@ -80,12 +79,6 @@ def has_confidence(stream: FrameSource) -> bool:
     return learns_confidence and any(
         gaussians.logit_confidence is not None for _, gaussians in first_frames
     )
-
-
-def has_offset(packets: Iterable[Packet]) -> bool:
-    """Return whether the residuals of a stream store the learned offset (off by default)."""
-    residuals = (packet for packet in packets if packet.kind == PacketKind.RESIDUAL)
-    return any("offset" in packet.arrays for packet in islice(residuals, 1))
 
 
 def channel_image(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:

@@ -97,34 +97,12 @@ def confidence_image(confidence: np.ndarray) -> np.ndarray:
     return _apply_colour_map(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
 
 
-def confidence_legend(size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `confidence_image`: a bar from 1 at the top to 0 at the
-    bottom.
-    """
-    ramp = np.repeat(np.linspace(1, 0, size)[:, None], size // 3, axis=1)
-    image = np.full((size, size, 3), BACKGROUND, np.uint8)
-    image[:, : ramp.shape[1]] = confidence_image(ramp)
-    for text, row in (("1 moving", 0.0), ("0.5", 0.5), ("0 static", 1.0)):
-        _write(image, text, (ramp.shape[1] + 4, round(12 + row * (size - 16))), 0.35, 0)
-    return image
-
-
 def _write(
     image: np.ndarray, text: str, origin: tuple[int, int], scale: float, grey: int, width: int = 1
 ) -> None:
     """Draw text into an image, with its lower left corner at `origin`."""
     color = (grey, grey, grey)
     cv2.putText(image, text, origin, _FONT, scale, color, width, cv2.LINE_AA)
-
-
-def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndarray:
-    """Return the same image column [H, 3] of every frame side by side, with time to the right
-    [H, W, 3].
-
-    Static surfaces appear as horizontal streaks, noise as roughness. The columns of a short clip
-    are repeated to a width of at least `least_width` pixels.
-    """
-    return np.repeat(to_uint8(np.stack(columns, axis=1)), -(-least_width // len(columns)), axis=1)
 
 
 def depth_image(depth: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ import numpy as np
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.playback.player import has_confidence, has_offset
+from morgs_mi.playback.player import has_confidence
 from morgs_mi.playback.stream_header import num_frames, open_stream_capture, render_config
 from tests.codec.forge import (
     damaged,
@@ -161,7 +161,6 @@ def check_readers(path: Path) -> None:
     for read in (
         render_config,
         has_confidence,
-        has_offset,
         num_frames,
         lambda stream: open_stream_capture(stream, None, [0]),
     ):

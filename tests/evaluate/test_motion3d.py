@@ -13,7 +13,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.motion3d import (
     compare_motion,
     evaluate_motion,
-    local_motion,
     rigid_motions,
     surface_ids,
 )
@@ -118,26 +117,3 @@ def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_ax
     assert score.true_length == pytest.approx(2 * 0.4 * np.sin(0.1))
     assert (score.relative_error, score.length_ratio) == pytest.approx((0.5, 1.5))
     assert score.angle == pytest.approx(0, abs=1e-5)  # an arc cosine near 1 halves the digits
-
-
-def test_local_motion__excludes_points_between_parts_that_move_apart():
-    tracked = (
-        rng.uniform(0.2, 1, (400, 3)) * (1, 1, 0) * np.where(np.arange(400) % 2, 1, -1)[:, None]
-    )
-    new_positions = tracked + np.sign(tracked[:, :1]) * [0, 0, 0.1]
-    motion = local_motion(np.array([(0.6, 0.6, 0.0), (0.0, 0.0, 0.0)]), tracked, new_positions)
-    assert_close(motion[0], [0, 0, 0.1], atol=1e-12)
-    assert np.isnan(motion[1]).all()
-
-
-def test_evaluate_motion__evaluates_gaussians_on_a_deforming_object():
-    tracked = rng.uniform(-1.5, 0, (600, 3)) * (1, 1, 0)
-    new_positions = tracked + 0.02 * tracked**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
-    means = np.array([(-1.0, -0.5, 0), (-1.2, -0.2, 0)])
-    true = 0.02 * means**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
-    views = [(FRONT, plane(4, 3, -1))]
-    score = evaluate_motion(
-        means, true, np.full(2, 0.9), (tracked, new_positions, np.full(600, 3)), views
-    )
-    assert score.num_gaussians == 2
-    assert score.relative_error < 0.02

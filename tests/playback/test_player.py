@@ -18,7 +18,6 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.player import (
     channel_image,
     has_confidence,
-    has_offset,
     playback_speed,
     render_stream,
 )
@@ -142,8 +141,6 @@ def test_has_confidence__only_where_it_was_learned(fitted_clip, tmp_path):
 
 def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip, tmp_path):
     write_stream(tmp_path / "s.morgs", {}, offset=0.25)
-    assert has_offset(open_stream(tmp_path / "s.morgs"))
-    assert not has_offset(open_stream(fitted_clip))
     played = list(
         render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset"))
     )

@@ -32,16 +32,6 @@ def test_confidence_image__brightens_with_confidence():
     assert (np.diff(ramp.sum(-1, dtype=int)[0]) > 0).all()
 
 
-def test_time_slice__time_increases_to_the_right():
-    columns = [np.full((5, 3), 10 * t, np.uint8) for t in range(4)]
-    columns[2][3] = 255
-    sliced = visualise.time_slice(columns, least_width=8)
-    assert sliced.shape == (5, 8, 3)
-    assert sliced[0, :, 0].tolist() == [0, 0, 10, 10, 20, 20, 30, 30]
-    assert (sliced == 255).all(-1).nonzero()[1].tolist() == [4, 5]
-    assert visualise.time_slice(columns * 100).shape == (5, 400, 3)
-
-
 def test_depth_image__near_is_red_far_is_blue_undefined_is_grey():
     depth = np.array([[1.0, 2.0, 10.0, 0.0, np.inf, np.nan]])
     red, _, blue, *undefined = visualise.depth_image(depth)[0].astype(int)

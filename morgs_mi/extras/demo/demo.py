@@ -20,7 +20,6 @@ from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.progress import Progress, Report, Steps
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.figures import motion_scale
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import stored_settings, synthesize
 from morgs_mi.fit.fit_config import FitConfig
@@ -183,7 +182,11 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: Steps) -> None:
 
 def _draw(out: Path, capture: Capture, report: Steps) -> None:
     """Write the video and the contact sheet."""
-    scale = motion_scale(capture, capture.cameras[capture.reference_view])
+    camera = capture.cameras[capture.reference_view]
+    truths = [truth_for_camera(capture, camera, frame) for frame in range(1, capture.num_frames)]
+    motions = [truth.motion[truth.mask] for truth in truths if truth is not None]
+    speeds = np.linalg.norm(np.concatenate([*motions, np.ones((1, 2))]), axis=1)
+    scale = float(np.percentile(speeds, 95))  # px
     full = _panels(capture, out / "stream", scale)
     plain = _panels(capture, out / "stream_plain", scale, ", no ML, MO, MC")
     names = ("truth", "render", "motion", "confidence")
