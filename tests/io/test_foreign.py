@@ -1,12 +1,6 @@
-"""Formats of Gaussians that are not read: recognised by content and by name, and named with what
-converts them.
-"""
+"""Formats of Gaussians that are not read are named with what converts them."""
 
 from __future__ import annotations
-
-import gzip
-import zipfile
-from io import BytesIO
 
 import pytest
 
@@ -14,41 +8,22 @@ from morgs_mi.extras.imports.import_frames import import_frames
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.streams import open_stream
 
-SPZ = gzip.compress(b"NGSP" + bytes(100))
-
-
-def archive(*names: str) -> bytes:
-    buffer = BytesIO()
-    with zipfile.ZipFile(buffer, "w") as file:
-        for name in names:
-            file.writestr(name, "{}")
-    return buffer.getvalue()
-
-
 FILES = {
-    "a.spz": (SPZ, "SPZ", "splat-transform"),
-    "c.ply": (SPZ, "SPZ", "splat-transform"),
-    "d.bin": (b"NGSP" + bytes(60), "SPZ", "splat-transform"),
-    "a.ksplat": (bytes(99), "KSPLAT", "SuperSplat"),
-    "b.ply": (archive("meta.json", "means_l.webp"), "SOG", "SuperSplat"),
-    "meta.json": (b"{}", "SOG", "SuperSplat"),
-    "e.ply.gz": (gzip.compress(b"ply\n"), "an archive", "unpack it"),
-    "a.glb": (b"glTF" + bytes(20), "glTF", "export it as .ply"),
-    "a.gltf": (b'{"extensionsUsed": ["KHR_gaussian_splatting"]}', "glTF", "export it as .ply"),
-    "g.splat": (b"ply\nformat ascii 1.0\n", "PLY", "rename it to .ply"),
-    "a.usdz": (archive("a.usdc"), "OpenUSD", "export it as .ply"),
-    "params.npz": (archive("means.npy"), "an archive of NumPy", "export it as .ply"),
-    "chkpnt30000.pth": (archive("data.pkl"), "a checkpoint", "export it as .ply"),
+    "a.spz": "splat-transform",
+    "meta.json": "SuperSplat",
+    "e.ply.gz": "unpack it",
+    "a.GLB": "export it as .ply",
+    "g.splat": "rename it to .ply",
+    "chkpnt30000.pth": "export it as .ply",
 }
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_refuse_foreign__names_format_and_remedy_at_every_door(tmp_path, name):
-    content, kind, remedy = FILES[name]
-    (tmp_path / name).write_bytes(content)
+def test_refuse_foreign__names_the_remedy_at_every_door(tmp_path, name):
+    (tmp_path / name).write_bytes(b"ply\nformat ascii 1.0\n" if name == "g.splat" else b"")
     for door in (open_stream, read_splats, lambda path: import_frames([path], tmp_path / "out")):
         with pytest.raises(
-            ValueError, match=rf"{name}: expected Gaussians as \.ply.*, got {kind}.*{remedy}"
+            ValueError, match=rf"{name}: expected Gaussians as \.ply.*{FILES[name]}"
         ):
             door(tmp_path / name)
 
@@ -60,5 +35,5 @@ def test_open_stream__names_what_to_do_with_a_folder_of_gaussians(tmp_path):
     ):
         open_stream(tmp_path)
     (tmp_path / "meta.json").write_text("{}")
-    with pytest.raises(ValueError, match="got SOG"):
+    with pytest.raises(ValueError, match="SuperSplat"):
         open_stream(tmp_path)
