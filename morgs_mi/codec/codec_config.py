@@ -26,10 +26,6 @@ class CodecConfig:
     everything, 1000 is as good as float32."""
     birth_precision: Annotated[float, Ge(1), Le(1024)] = 4.0
     """Factor of the precision of new Gaussians: they are written once and seen for many frames."""
-    offset: bool = False
-    """Storage of the learned offset of moving Gaussians, for viewing; no other value is decoded
-    from it.
-    """
     target_size: NonNegativeInt = 0
     """Bound of the bytes of a later frame, which is coded more coarsely until it fits; 0: no bound.
     """

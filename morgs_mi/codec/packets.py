@@ -38,7 +38,7 @@ from morgs_mi.codec.quantisation import (
     optional_mask,
     real_values,
 )
-from morgs_mi.codec.residuals import Coder, offset_steps, take_change
+from morgs_mi.codec.residuals import Coder, take_change
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
@@ -47,7 +47,6 @@ from morgs_mi.core.gaussians import Gaussians
 # the state has more than 2^22. The integers of a fit take about four bits each, twice as much.
 _PER_WORD = 16
 _FREE_INTEGERS = 2**22
-_DTYPES = {"head": "uint32", "code": "uint32", "parent": "uint8", "offset": "uint32"}
 _MAX_QUANTIZER_STEP = 80  # quarter octaves: a million times the step
 
 
@@ -132,8 +131,7 @@ def residual_packet(
 
     Args:
         previous: state of the decoder, N Gaussians.
-        gaussians: N' Gaussians of the next frame with the same attributes; with `config.offset`,
-            `offset` is stored where the means change.
+        gaussians: N' Gaussians of the next frame with the same attributes.
         source: int [N'], see above; None if there are no births and no deaths.
         cameras: cameras in which the error of births is measured.
         config: tolerated errors.
@@ -163,11 +161,7 @@ def residual_packet(
     new_groups = {name: value[indices] for name, value in groups.items()}
     change = real_values(new_groups, grid.select(rows))
     change -= grid.values[rows].T
-    offset = None
-    if config.offset:
-        zero = np.zeros((len(gaussians), 3))
-        offset = zero if gaussians.offset is None else np.asarray(gaussians.offset)
-    coder = Coder(grid, survivors, rows, change, offset)
+    coder = Coder(grid, survivors, rows, change)
 
     births = len(gaussians) - len(survivors)
     birth_groups = {name: value[len(survivors) :] for name, value in groups.items()}
@@ -193,7 +187,7 @@ def _sized_codes(
         # The least quantizer step at which the changes are estimated to take `target` bytes.
         def fits(step: int) -> bool:
             r = coder.rounded(step)
-            bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, step))))
+            bits = sum(map(column_bits, coder.columns(r)))
             return bits / 8 <= target
 
         steps = range(_MAX_QUANTIZER_STEP)
@@ -226,6 +220,7 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         expected = {"head": "uint32 [n]", "code": "uint32 [n]"}
         if is_residual:
             expected |= {"parent": "uint8 [n]"}
+            # Earlier streams may have the learned part of the motion, which nothing else reads.
             expected |= {"offset": "uint32 [n]"} if "offset" in packet.arrays else {}
         arrays = {
             name: f"{array.dtype} {'[n]' if array.ndim == 1 else list(array.shape)}"
@@ -278,15 +273,6 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     motion = np.zeros((total, 3), np.float32)
     previous_means = np.asarray(previous.gaussians.means)[survivors]
     motion[: len(survivors)] = new.real("means").astype(np.float32) - previous_means
-    offset = None
-    if "offset" in packet.arrays:
-        # Of the survivors whose means change, as `Coder.offsets` yields them.
-        at = grid.columns["means"]
-        rows = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
-        offset_reader = ColumnReader(packet.arrays["offset"])
-        r = np.stack([offset_reader.take(len(rows)) for _ in range(3)], axis=1)
-        offset = np.zeros((total, 3), np.float32)
-        offset[rows] = r * offset_steps(new.select(rows), quantizer_step)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     new_ids = previous.next_id + np.arange(births, dtype=np.uint32)
@@ -294,7 +280,7 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
         previous,
         frame=packet.frame,
         ids=np.concatenate([previous.ids[survivors], new_ids]),
-        gaussians=new.gaussians(motion, offset),
+        gaussians=new.gaussians(motion),
         grid=new,
         next_id=previous.next_id + births,
     )
@@ -355,10 +341,7 @@ def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid) -> dict[str, np.
     births = len(birth_grid)
     words = _words(chain(coder.columns(r), _grid_columns(birth_grid) if births else ()))
     total = len(coder.survivors) + births
-    codes = {"code": _padded(words, births, total, birth_grid.num_integers)}
-    if coder.offset is not None:
-        codes["offset"] = _words(coder.offsets(r, quantizer_step))
-    return codes
+    return {"code": _padded(words, births, total, birth_grid.num_integers)}
 
 
 def _head(packet: Packet, limits: dict[str, int]) -> list[int]:

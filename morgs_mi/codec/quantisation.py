@@ -111,14 +111,11 @@ class Grid:
         }
         return replace(self, **both)
 
-    def gaussians(
-        self, motion: np.ndarray | None = None, offset: np.ndarray | None = None
-    ) -> Gaussians:
+    def gaussians(self, motion: np.ndarray | None = None) -> Gaussians:
         """Return the Gaussians that the integers stand for.
 
         Args:
             motion: displacement since the frame before, float32 [N, 3]; None for zero.
-            offset: learned part of the displacement, float32 [N, 3]; None if it is unknown.
         """
         optional = {
             name: self._single(name).reshape(len(self), *_STORED[name].shape)
@@ -132,7 +129,6 @@ class Grid:
             logit_opacities=self._single("logit_opacities")[:, 0],
             sh_coeffs=np.concatenate(sh, 1).reshape(len(self), (self.degree + 1) ** 2, 3),
             motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
-            offset=offset,
             **optional,
         )
 

@@ -33,9 +33,6 @@ class Coder:
     survivors: np.ndarray  #: Their indices in the state [S], ascending; the others die.
     rows: np.ndarray  #: Indices of the M survivors that differ.
     change: np.ndarray  #: Their differences by integer, in multiples of the grid's steps [C, M].
-    #: Offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not
-    #: stored.
-    offset: np.ndarray | None
 
     def rounded(self, quantizer_step: int) -> np.ndarray:
         """Return the changes in whole steps, int32 [C, N]."""
@@ -61,24 +58,6 @@ class Coder:
                 yield flags[rows[some]] // _DEAD
             for name, at in self.grid.columns.items():
                 yield from r[at].take(rows[flags[rows] >> GROUPS.index(name) & 1 == 1], axis=1)
-
-    def offsets(self, r: np.ndarray, quantizer_step: int) -> Iterator[np.ndarray]:
-        """Yield the columns of the offsets of the survivors with changed means; none if they are
-        not stored.
-        """
-        if self.offset is not None:
-            rows = np.flatnonzero(np.any(r[self.grid.columns["means"]], axis=0)[self.survivors])
-            real = self.offset[rows] / offset_steps(
-                self.grid.select(self.survivors[rows]), quantizer_step
-            )
-            yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
-
-
-def offset_steps(grid: Grid, quantizer_step: int) -> np.ndarray:
-    """Return the steps of the offsets, float64 [N, 1], world units, which are the steps of the
-    changes of the means.
-    """
-    return grid.steps("means") * _step(quantizer_step)
 
 
 def take_change(

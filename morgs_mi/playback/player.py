@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -20,7 +19,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.png import png_bytes
-from morgs_mi.core.types import Tensor
 from morgs_mi.playback.stream_header import metadata_entry, render_config, stream_exposure
 from morgs_mi.playback.visualise import (
     confidence_image,
@@ -38,10 +36,6 @@ MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per
 frame.
 """
-OFFSET_SCALE = 0.1
-"""The same for the learned offset, as a fraction of that speed: the offset is the smaller part of
-the motion.
-"""
 _MOST_TIMED_FRAMES = 30
 
 
@@ -53,11 +47,11 @@ def render_stream(
     Args:
         stream: the file.
         camera: any view, not necessarily one of the rig.
-        channels: such as `alpha` and `offset`; None for `available_channels`.
+        channels: such as `alpha`; None for `available_channels`.
 
     Yields:
-        (frame, images): per channel a float32 array [H, W, C], colour display-referred, motion and
-        offset in pixels, depth in world units.
+        (frame, images): per channel a float32 array [H, W, C], colour display-referred, motion in
+        pixels, depth in world units.
 
     Raises:
         ValueError: an unknown channel, a channel that the stream does not store, or a broken
@@ -87,12 +81,11 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     Args:
         name: of the channel.
         image: values of the channel [H, W, C].
-        motion_scale: speed of full saturation in pixels, `OFFSET_SCALE` times that for an offset.
-            The default is `MOTION_SCALE`, which is the same for all frames of a clip.
+        motion_scale: speed of full saturation in pixels. The default is `MOTION_SCALE`, which is
+            the same for all frames of a clip.
     """
-    if name in ("motion", "offset"):
-        scale = motion_scale or MOTION_SCALE * image.shape[1]
-        return motion_image(image, scale if name == "motion" else OFFSET_SCALE * scale)
+    if name == "motion":
+        return motion_image(image, motion_scale or MOTION_SCALE * image.shape[1])
     draw = {"color": to_uint8, "confidence": confidence_image, "depth": depth_image}
     return draw.get(name, grey_image)(image)
 
@@ -149,20 +142,9 @@ def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
 def render(
     gaussians: Gaussians, camera: Camera, channels: Sequence[str], config: RenderConfig
 ) -> dict[str, np.ndarray]:
-    """Return rendered channels as float32 arrays [H, W, C] by name; the offset is zero where none
-    is stored.
-    """
-    names = [name for name in channels if name != "offset"]
-    images: dict[str, Tensor] = {}
-    if names:
-        image = rasterize(gaussians, camera, names, config=config)
-        images = {name: image[name] for name in names}
-    if "offset" in channels:
-        zero = np.zeros((len(gaussians), 3))
-        offset = zero if gaussians.offset is None else gaussians.offset
-        offset_gaussians = replace(gaussians, motion=offset)
-        images["offset"] = rasterize(offset_gaussians, camera, ("motion",), config=config).motion
-    return {name: np.array(images[name]) for name in channels}
+    """Return rendered channels as float32 arrays [H, W, C] by name."""
+    image = rasterize(gaussians, camera, channels, config=config)
+    return {name: np.array(image[name]) for name in channels}
 
 
 def picture(

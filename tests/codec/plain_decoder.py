@@ -160,18 +160,6 @@ def residual(state, payload):
         **{name: state[name][~dead] for name in ("ids", "largest_components", "exponents")},
         "values": values[~dead],
     }
-    new.pop("offset", None)
-    if "offset" in changes:
-        new["offset"] = np.zeros((len(new["ids"]) + births, 3))
-        rows = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
-        code_of_offsets = RangeCode(changes["offset"])
-        for axis in range(3):
-            for i, r in zip(rows, code_of_offsets.column(len(rows)), strict=True):
-                e = int(new["exponents"][i, 0])
-                step = (F[e % 4] * 2.0 ** (e // 4)) * (
-                    F[quantizer_step % 4] * 2.0 ** (quantizer_step // 4)
-                )
-                new["offset"][i, axis] = int(r) * step
     if births:
         added = born(code, births, state["degree"], state["confidence"])
         for name, array in zip(("largest_components", "exponents", "values"), added, strict=True):
@@ -207,8 +195,6 @@ def numbers(state):
     values["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
     if state["confidence"]:
         values["logit_confidence"] = real[:, end]
-    if "offset" in state:
-        values["offset"] = state["offset"]
     return {name: value.astype(np.float32) for name, value in values.items()}
 
 

@@ -45,6 +45,9 @@ def summary(path: Path) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("path", sorted(STREAMS.glob("*.morgs")), ids=lambda path: path.stem)
 def test_old_streams__decode_to_the_same_numbers(path):
     expected = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    # The learned part of the motion is no longer read.
+    for row in expected:
+        row.pop("offset", None)
     assert summary(path) == expected
     assert (
         StreamReader(path).seek(expected[-1]["frame"]).digest.tobytes().hex()

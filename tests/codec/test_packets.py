@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.packets import (
     coded_frames,
@@ -23,9 +22,8 @@ from tests.codec import plain_decoder
 from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, jittered, write
 
 
-@pytest.mark.parametrize("config", [None, CodecConfig(offset=True)], ids=["", "offset"])
-def test_decode__equals_a_decoder_from_the_specification(tmp_path, config):
-    packets, states = encoded_clip(6, config)
+def test_decode__equals_a_decoder_from_the_specification(tmp_path):
+    packets, states = encoded_clip(6)
     write(tmp_path / "s", packets, states, every=3)
     plain = list(plain_decoder.states((tmp_path / "s").read_bytes()))
     assert [frame for frame, _ in plain] == [state.frame for state in states]
@@ -42,33 +40,6 @@ def test_residual_packet__of_a_static_frame_is_nearly_empty():
     packet = residual_packet(state, state.gaussians)
     assert len(packet.encoded) < 200
     np.testing.assert_array_equal(decode(state, packet).grid.values, state.grid.values)
-
-
-def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing_else():
-    plain, plain_states = encoded_clip(4)
-    packets, states = encoded_clip(4, CodecConfig(offset=True))
-    assert [state.gaussians.offset is None for state in states] == [True, False, False, False]
-    assert all(state.gaussians.offset is None for state in plain_states)
-    for without, packet in zip(plain, packets, strict=True):
-        assert {"offset"} >= packet.arrays.keys() - without.arrays.keys()
-        for name, array in without.arrays.items():
-            assert np.array_equal(packet.arrays[name], array)
-    rng = np.random.default_rng(3)
-    state = states[-1]
-    next_gaussians = replace(
-        jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3))
-    )
-    values = decode(
-        state, residual_packet(state, next_gaussians, None, CAMERAS, CodecConfig(offset=True))
-    ).gaussians.numpy()
-    mask = values["motion"].any(1)
-    assert 0.2 < mask.mean() < 0.6
-    # The step of a moved mean is four times the step of its birth.
-    error = np.abs(values["offset"] - next_gaussians.numpy()["offset"])[mask] / (
-        4 * state.grid.steps("means")[mask]
-    )
-    assert 0.45 < error.max() <= 0.5 + 1e-4
-    assert not values["offset"][~mask].any()
 
 
 def test_residual_packet__of_a_decoded_state_reproduces_it():
@@ -157,10 +128,6 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
         (
             lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)),
             r"expected the arrays .* got {'parent': 'uint32 \[n\]'",
-        ),
-        (
-            lambda _, residual: with_array(residual, "offset", np.full(60, 2**32 - 1, "u4")),
-            "its code is broken",
         ),
         (
             lambda _, residual: replace(residual, frame=0),

@@ -78,15 +78,13 @@ def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors():
     assert errors[-1] < 2e-6
 
 
-@pytest.mark.parametrize(("target", "offset"), [(2000, False), (8000, False), (8000, True)])
-def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target, offset):
+@pytest.mark.parametrize("target", [2000, 8000])
+def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target):
     """Offsets count towards it."""
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     rng = np.random.default_rng(1)
     changed_gaussians = jittered(state.gaussians, rng, share=1)
-    if offset:
-        changed_gaussians = replace(changed_gaussians, offset=rng.normal(0, 0.02, (1500, 3)))
-    config = CodecConfig(target_size=target, offset=offset)
+    config = CodecConfig(target_size=target)
     packet = residual_packet(state, changed_gaussians, None, CAMERAS, config)
     sizes = [packet.arrays[name].nbytes for name in ("code", "offset") if name in packet.arrays]
     # It has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.

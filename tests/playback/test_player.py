@@ -32,7 +32,6 @@ from morgs_mi.playback.stream_header import (
 )
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.render.render_config import RenderConfig
-from tests.assertions import assert_close
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
@@ -137,21 +136,6 @@ def test_has_confidence__only_where_it_was_learned(fitted_clip, tmp_path):
     write_stream(tmp_path / "none.morgs", {}, logit=None)
     assert not has_confidence(open_stream(tmp_path / "off.morgs"))
     assert not has_confidence(open_stream(tmp_path / "none.morgs"))
-
-
-def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip, tmp_path):
-    write_stream(tmp_path / "s.morgs", {}, offset=0.25)
-    played = list(
-        render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset"))
-    )
-    assert not played[0][1]["offset"].any(), "the first frame stores no offset"
-    for _, images in played[1:]:
-        assert np.abs(images["motion"]).max() > 0.4
-        assert_close(images["offset"], 0.25 * images["motion"], atol=1e-4)
-    for _, images in render_stream(open_stream(fitted_clip), CAMERAS[0], ("offset",)):
-        assert not images["offset"].any()
-    tenth = channel_image("offset", 0.1 * images["offset"] + 0.05)
-    np.testing.assert_array_equal(tenth, channel_image("motion", images["offset"] + 0.5))
 
 
 def test_playback_speed__is_the_inverse_of_the_time_per_frame(fitted_clip, tmp_path):

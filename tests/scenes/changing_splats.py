@@ -1,6 +1,4 @@
-"""Splats that move, are born and die, seen by three cameras with z up, and their stream with
-learned offsets.
-"""
+"""Splats that move, are born and die, seen by three cameras with z up, and their stream."""
 
 from __future__ import annotations
 
@@ -24,8 +22,6 @@ from tests.scenes.cameras import look_at_cameras
 
 NAMES = ("left", "middle", "right")
 TARGET = (0, 0, 0.2)
-# Learned part of a displacement of 0.1 along x: two steps of its quantisation grid.
-OFFSET = (0, 0, 0.008)
 
 
 def rig(width: int = 64, height: int = 48) -> tuple[Camera, ...]:
@@ -55,7 +51,7 @@ def write_stream(
     metadata: dict | None = None,
     keyframe_interval: int = 0,
 ) -> list[CodedFrame]:
-    """Write a stream with offsets and return its decoded frames; 0: only the first frame has a
+    """Write a stream and return its decoded frames; 0: only the first frame has a
     keyframe.
 
     The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
@@ -82,6 +78,5 @@ def write_stream(
                     [replace(target.select(source[1:]), motion=None, offset=None), born]
                 )
                 source = np.concatenate([source[1:], [-1, -1]])
-            target = replace(target, offset=np.tile(np.float32(OFFSET), (len(target), 1)))
-            packet = residual_packet(states[-1], target, source, cameras, CodecConfig(offset=True))
+            packet = residual_packet(states[-1], target, source, cameras, CodecConfig())
     return states

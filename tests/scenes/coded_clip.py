@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 
@@ -69,10 +68,6 @@ def encoded_clip(
             if births
             else survivors
         )
-        if config is not None and config.offset:
-            target = replace(
-                target, offset=np.random.default_rng(frame).normal(0, 0.02, (len(target), 3))
-            )
         source = np.concatenate([alive, np.full(births, -1)])
         packets.append(residual_packet(state, target, source, CAMERAS, config))
         states.append(decode(state, packets[-1]))

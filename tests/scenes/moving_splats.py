@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,22 +45,14 @@ def write_stream(
     metadata: dict,
     logit: float | None = 0.0,
     shift: float = 0,
-    offset: float | None = None,
 ) -> list[Packet]:
-    """Write the stream of the splats, shifted by `shift` steps, and return its packets.
-
-    With an `offset`, that share of each step along x is the learned offset.
-    """
+    """Write the stream of the splats, shifted by `shift` steps, and return its packets."""
     first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
     state = decode(None, first)
     packets = [first]
     for frame in range(1, FRAMES):
         gaussians = moved(frame + shift, logit)
-        config = replace(EXACT, offset=offset is not None)
-        gaussians = replace(
-            gaussians, offset=np.tile((STEP * (offset or 0), 0, 0), (len(gaussians), 1))
-        )
-        packets.append(residual_packet(state, gaussians, None, CAMERAS, config))
+        packets.append(residual_packet(state, gaussians, None, CAMERAS, EXACT))
         state = decode(state, packets[-1])
     with StreamWriter(path, CAMERAS, 25, metadata) as writer:
         for packet in packets:

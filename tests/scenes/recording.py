@@ -28,7 +28,7 @@ FRAMES = 6
 # As little as a fit can do with all that it does: births, deaths, masks, keyframes, offsets.
 CONFIG = quick(
     MotionConfig(key_views=1, mask_interval=2),
-    codec=CodecConfig(keyframe_interval=2, offset=True),
+    codec=CodecConfig(keyframe_interval=2),
     epochs=2,
     density=DensityConfig(rounds=2, births=0.05, max_gaussians=84, min_error=0),
 )

@@ -7,7 +7,6 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +57,7 @@ def short_clip() -> Clip:
     """
     file = io.BytesIO()
     rng = np.random.default_rng(0)
-    config = CodecConfig(quality=0.3, offset=True)
+    config = CodecConfig(quality=0.3)
     with StreamWriter(file, CAMERAS[:1], 25, METADATA) as writer:
         packet = keyframe_packet(cloud(6, 0), 0, CAMERAS, config)
         states = [decode(None, packet)]
@@ -69,7 +68,6 @@ def short_clip() -> Clip:
             target = Gaussians.concatenate(
                 [jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)]
             )
-            target = replace(target, offset=rng.normal(0, 0.05, (len(target), 3)))
             packet = residual_packet(old_state, target, np.r_[alive, -1], CAMERAS, config)
             states.append(decode(old_state, packet))
             writer.write(packet)
