@@ -8,6 +8,7 @@ import gc
 import json
 import threading
 from itertools import pairwise
+from pathlib import Path
 from unittest.mock import Mock
 
 import mitsuba as mi
@@ -337,7 +338,7 @@ def test_stream_capture__writes_a_file(tmp_path):
     names = sorted(p.name for p in path.parent.iterdir())
     assert names == ["capture.json", "report.json", "stream.morgs"]
     settings = json.loads((tmp_path / "out" / "capture.json").read_text())
-    assert settings == {"layout": "noise", "capture": str(capture.path)}
+    assert settings == {"layout": "noise", "capture": str(Path(capture.path).resolve())}
 
 
 def new(cameras_of_loop=None, points=(), colors=(), **more):

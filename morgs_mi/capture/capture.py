@@ -265,6 +265,7 @@ class Capture:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """
+        stop = self.num_frames if stop is None else min(stop, self.num_frames)
         return self._sources[view].images(self.cameras[view], start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -279,9 +280,7 @@ class Capture:
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
-        streams = [
-            s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)
-        ]
+        streams = [self.images(view, start, stop) for view in range(len(self.cameras))]
         missing: set[str] = set()
         try:
             for index, results in enumerate(zip(*streams, strict=True), start=start):

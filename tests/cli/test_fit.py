@@ -267,7 +267,8 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture, tmp_path):
     number of frames.
     """
     script = (
-        "import resource, sys; from morgs_mi.codec import container; from morgs_mi import cli\n"
+        "import resource, sys; from morgs_mi.codec import container\n"
+        "from morgs_mi.cli.main import main\n"
         "write = container.StreamWriter.write\n"
         "def limited(writer, packet):\n"
         "    if packet.frame:\n"

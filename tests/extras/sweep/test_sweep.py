@@ -90,8 +90,8 @@ def test_leave_out__parts_of_the_first_frame_have_their_own(tmp_path, monkeypatc
     settings = tmp_path / "settings.toml"
     settings.write_text(config_toml(replace(CONFIG, seed=5)))
     options = ("--seeds", 1, "--frames", 2, "--config", settings, "--tolerance", 100)
-    status, output, _ = run("sweep", clip, out, "--leave-out", *options)
-    assert status == 0
+    status, output, error = run("sweep", clip, out, "--leave-out", *options)
+    assert status == 0, error
     assert "Within 100 dB, this scene does not need offset, exposure" in output
     for name in names:
         config = open_stream(out / f"without-{name}-epochs2-seed0").metadata["config"]
