@@ -229,7 +229,7 @@ class StreamLoop:
         self.state = StreamState()
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
-        self._resident = 0  # bytes, above which memory is released
+        self._resident = 0  # bytes, before memory was last released
         # Whether images in a list may be in another order than the cameras.
         self._can_mistake_order = True
 
@@ -303,15 +303,12 @@ class StreamLoop:
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
         memory = process_memory()
-        resident = memory.get("resident", 0)
         # Buffers for more active Gaussians have a new size, and the smaller ones stay allocated.
         # The buffers of the first frame are not used again.
-        if resident > _GROWTH * self._resident:
-            self._resident = resident if frame else 0
+        if memory.get("resident", 0) > _GROWTH * self._resident:
+            self._resident = memory["resident"] if frame else 0
             release_memory()
             memory = process_memory()
-        else:
-            self._resident = min(self._resident, resident)
         return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)
 
     def _observation_ahead(self, images: Frame) -> FrameObservation | None:
