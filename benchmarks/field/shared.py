@@ -4,6 +4,8 @@ parameters.
 
 from __future__ import annotations
 
+from typing import cast
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -30,7 +32,7 @@ def summed_motion(
         translation_step: step of the translations, in scene extents; 0: not rounded.
         rotation_step: step of the rotations; 0: not rounded.
     """
-    size = matrix.shape[1]
+    _, size = cast("tuple[int, int]", matrix.shape)
     steps = {"translation": translation_step * extent, "rotation": rotation_step}
     return MotionModel(
         {

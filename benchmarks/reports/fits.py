@@ -107,7 +107,8 @@ class Clip:
         metadata = {"capture": str(capture.path.resolve()), "downscale": capture.downscale}
         metadata |= {"test_view": list(capture.test_views), "config": asdict(config)}
         loop = new_loop(capture, config)
-        loop.resume(*coded_frames([keyframe]), self.images[:1])
+        (coded,) = coded_frames([keyframe])
+        loop.resume(coded, self.images[:1])
         packets = [keyframe]
         reports = []
         seconds = []

@@ -261,7 +261,9 @@ class Capture:
         """
         yield from prefetched(self._decoded(start, stop, False))
 
-    def images(self, view: int, start: int = 0, stop: int | None = None) -> Iterator[ImageOrError]:
+    def images(
+        self, view: int, start: int = 0, stop: int | None = None
+    ) -> Generator[ImageOrError, None, None]:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """

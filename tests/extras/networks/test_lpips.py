@@ -19,8 +19,9 @@ EXPECTED = (4 * (IMAGE - TRUTH) ** 2).mean(-1)
 def test_lpips__spatial_network_gives_a_map(tmp_path):
     net = Lpips(squared_difference(tmp_path / "net.onnx", H, W))
     assert_close(net.distance_map(IMAGE, TRUTH), EXPECTED, atol=1e-6)
-    images = np.uint8(255 * np.stack([IMAGE, TRUTH]))
-    np.testing.assert_allclose(net.distance_map(*images), net.distance_map(*(images / 255)))
+    image, truth = ((255 * values).astype(np.uint8) for values in (IMAGE, TRUTH))
+    expected = net.distance_map(image / 255, truth / 255)
+    np.testing.assert_allclose(net.distance_map(image, truth), expected)
 
 
 def test_lpips__other_network_gives_one_number(tmp_path):
