@@ -64,6 +64,8 @@ class Fit:
     scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS", text=_SCHEDULER)] = None
     print_config: Flag = False
     """Print all settings as TOML and exit."""
+    reproducible: Flag = False
+    """Sum in a fixed order: on a CPU every fit does; a GPU cannot."""
 
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
 
