@@ -85,7 +85,7 @@ def measure(
     aligned_capture = load_capture(
         recording.path, reading=replace(recording.reading, offset=offsets)
     )
-    # Its frames have other numbers than those of the truth, which `moving_psnr` converts.
+    # `moving_psnr` converts its frame numbers to the numbers of the ground truth.
     aligned_capture = replace(aligned_capture, truth=recording.truth)
     first = int(
         aligned_capture.metadata()["cameras"][recording.names.index(reference)]["first_frame"]

@@ -20,17 +20,17 @@ _LOG = logging.getLogger(__name__)
 _PLACES: dict[str, dict[str, str]] = {}
 
 
-def enter(package: str, registry: str, places: Mapping[str, str]) -> None:
+def enter(package: str, registry: str, entries: Mapping[str, str]) -> None:
     """Add entries of an extra to a registry.
 
     Args:
         package: of the extra, its `__name__`.
         registry: "commands", "exports", "integrators", "renderings", "layouts", "image checks",
             "camera refinement", "flow sources", "mask refiners" or "image distances".
-        places: MODULE or MODULE:NAME inside the package, by the name of the entry. A source of flow
-            or a refiner of masks may have an argument, as in ``onnx:FILE``.
+        entries: MODULE or MODULE:NAME inside the package, by the name of the entry. A source of
+            flow or a refiner of masks may have an argument, as in ``onnx:FILE``.
     """
-    full_places = {name: f"{package}.{place}" for name, place in places.items()}
+    full_places = {name: f"{package}.{place}" for name, place in entries.items()}
     _PLACES.setdefault(registry, {}).update(full_places)
 
 
@@ -46,12 +46,13 @@ def extra(registry: str, name: str) -> Any:
     Raises:
         ValueError: none has.
     """
-    if name not in places(registry):
+    place = places(registry).get(name)
+    if place is None:
         raise ValueError(
             f"{registry}: expected an extra that adds {name}, found none; install morgs_mi with "
             "its folder extras."
         )
-    return resolve_name(places(registry)[name])
+    return resolve_name(place)
 
 
 def extra_function(registry: str, name: str) -> Callable[..., Any]:

@@ -54,11 +54,10 @@ def evaluate_motion(
     rigid = rigid_motions(*tracks)
     true = np.zeros_like(means, float)
     mask = np.zeros(len(means), bool)
-    for index in rigid:
+    for index, (rotation, shift) in rigid.items():
         starts, ends = (points[tracks[2] == index] for points in tracks[:2])
         longest = np.linalg.norm(ends - starts, axis=-1).max()
         on = (ids == index) & (opacities >= _LEAST_OPACITY)
-        rotation, shift = rigid[index]
         true[on] = means[on] @ (rotation - np.eye(3)).T + shift
         mask |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
     return compare_motion(displacements[mask], true[mask])
@@ -135,9 +134,7 @@ def rigid_motions(
 
 
 def _rotation(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the rotations [..., 3, 3] that best map points p to q [..., P, 3], both around their
-    means.
-    """
-    U, _, Vt = np.linalg.svd(q.swapaxes(-1, -2) @ p)
-    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    """Return the rotation [3, 3] that best maps points p to q [P, 3], both around their means."""
+    U, _, Vt = np.linalg.svd(q.T @ p)
+    U[:, 2] *= np.linalg.det(U @ Vt)
     return U @ Vt

@@ -5,16 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 _CONVERTED = (".spz", ".ksplat", ".sog", ".sogs", "meta.json", ".lcc")
-_MESHES = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
-_OTHERS = (".splatv", ".gsz", ".rad", ".splatz", ".cply", ".npz", ".npy", ".pt", ".pth", ".ckpt")
+_EXPORTED = (
+    *(".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz"),
+    *(".splatv", ".gsz", ".rad", ".splatz", ".cply", ".npz", ".npy", ".pt", ".pth", ".ckpt"),
+)
 _PACKED = (".zip", ".7z", ".tar", ".gz", ".tgz")
-_EXPORT = "export it as .ply in the layout of 3D Gaussian Splatting from the program that wrote it"
 # What to do with files of some endings.
 _REMEDIES = {
     _CONVERTED: "convert it to .ply with SuperSplat (superspl.at/editor) or splat-transform "
     "(@playcanvas/splat-transform)",
-    _MESHES: _EXPORT,
-    _OTHERS: _EXPORT,
+    _EXPORTED: "export it as .ply in the layout of 3D Gaussian Splatting from the program that "
+    "wrote it",
     _PACKED: "unpack it, and name the .ply in it",
 }
 

@@ -212,32 +212,35 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     return matches.pop() if len(matches) == 1 else None
 
 
-def image_size(folder: Path, image: str, clips: Mapping[str, Clip]) -> tuple[int, int] | None:
-    """Return the width and height of an image, None if it has neither a file nor a clip.
+def clip_of_image(folder: Path, image: str, clips: Mapping[str, Clip]) -> Clip | None:
+    """Return the file or the clip of an image, None if it has neither.
 
     Args:
         folder: the folder of the calibration, from which the image is named.
         image: its name.
         clips: clips by name, for images that are no files.
+    """
+    file = folder / image.replace("\\", "/")
+    if not file.is_file() and file.parent.is_dir():  # a name without the suffix
+        files = {other.stem: other for other in images_in(file.parent)}
+        file = files.get(file.name, file)
+    if file.is_file():
+        return file
+    name = view_of_image(clips, image, by_folder=True)
+    return None if name is None else clips[name]
+
+
+def size_of_clip(clip: Clip) -> tuple[int, int]:
+    """Return the width and height of a clip or of an image file.
 
     Raises:
-        ValueError: the file or the clip cannot be read.
+        ValueError: it cannot be read.
     """
-    clip: Clip = folder / image.replace("\\", "/")
-    if not clip.is_file() and clip.parent.is_dir():  # a name without the suffix
-        files = {file.stem: file for file in images_in(clip.parent)}
-        clip = files.get(clip.name, clip)
-    if clip.is_file():
+    if isinstance(clip, Path) and clip.is_file() and clip.suffix.lower() not in VIDEO_SUFFIXES:
         size = imagesize.get(clip)
         if min(size) > 0:
             return size
-        # No header of an image, or one that does not show its size.
-        if clip.suffix.lower() not in VIDEO_SUFFIXES:
-            clip = (clip,)
-    elif name := view_of_image(clips, image, by_folder=True):
-        clip = clips[name]
-    else:
-        return None
+        clip = (clip,)  # its header does not show its size
     reader = open_frames(clip)
     return reader.width, reader.height
 

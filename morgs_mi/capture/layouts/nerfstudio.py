@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -26,7 +27,7 @@ from morgs_mi.capture.layouts.calibration import (
     match_clips,
     required_clips,
 )
-from morgs_mi.capture.layouts.clips import image_size
+from morgs_mi.capture.layouts.clips import clip_of_image, size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, rigid
@@ -202,6 +203,7 @@ def _read_calibration(path: Path) -> Calibration:
     cameras = []
     lenses = []
     masks = []
+    size_of = cache(size_of_clip)  # many images may be in one clip
     unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     for index, frame in enumerate(frames):
         values = meta | frame
@@ -210,8 +212,9 @@ def _read_calibration(path: Path) -> Calibration:
         if not {"w", "h"} <= values.keys():
             # Of another image if it is missing: its camera is left out later.
             names = [name, *(str(other.get("file_path")) for other in frames)]
-            sizes = (image_size(path, each, clips) for each in names)
-            values |= zip(("w", "h"), next(filter(None, sizes), ()), strict=False)
+            files = (clip_of_image(path, each, clips) for each in names)
+            file = next(filter(None, files), None)
+            values |= zip(("w", "h"), () if file is None else size_of(file), strict=False)
         with errors_at(f"{source}, frame {index} ({name})"):
             cameras.append(_camera(values, name))
             lenses.append(_lens(values))
