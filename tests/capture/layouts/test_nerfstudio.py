@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.clips import size_of_clip
 from morgs_mi.capture.layouts.nerfstudio import READER
 from tests.assertions import assert_close
 from tests.capture.layouts.test_layouts import edit
@@ -209,13 +211,21 @@ def test_nerfstudio__takes_missing_sizes_from_the_images(
         assert_close(camera.K, [[50, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]], atol=PIXEL_ABS)
 
 
-def test_nerfstudio__takes_missing_sizes_from_clips_and_leaves_out_missing_ones(
-    tmp_path: Path,
+def test_nerfstudio__takes_missing_sizes_from_clips_once_and_leaves_out_missing_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
-    edit(path, lambda meta: [meta.pop(side) for side in "wh"])
+
+    def change(meta: dict) -> None:
+        del meta["w"], meta["h"]
+        meta["frames"] *= 3  # three images of each clip
+
+    edit(path, change)
     (path / "cam1.mkv").unlink()
+    reading = Mock(wraps=size_of_clip)
+    monkeypatch.setattr("morgs_mi.capture.layouts.nerfstudio.size_of_clip", reading)
     capture = load_capture(path)
+    assert reading.call_count == 2
     assert [(camera.name, camera.width) for camera in capture.cameras] == [
         ("cam2", WIDTH),
         ("cam10", WIDTH),
