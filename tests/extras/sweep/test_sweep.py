@@ -92,14 +92,15 @@ def test_leave_out__parts_of_the_first_frame_have_their_own(tmp_path, monkeypatc
     options = ("--seeds", 1, "--frames", 2, "--config", settings, "--tolerance", 100)
     status, output, error = run("sweep", clip, out, "--leave-out", *options)
     assert status == 0, error
-    assert "Within 100 dB, this scene does not need offset, exposure" in output
     for name in names:
         config = open_stream(out / f"without-{name}-epochs2-seed0").metadata["config"]
         assert config["motion"]["learn_offset"] == (name != "offset")
         assert config["fit"]["exposure"] == ("off" if name == "exposure" else "auto")
+    # Whether a part is needed also depends on the seconds, which the load of the machine changes.
+    sentence = next(line for line in output.splitlines() if line.startswith("Within 100 dB"))
     config = apply_values(StreamConfig(), read_config(out / "leave-out.toml"))
-    assert not config.motion.learn_offset
-    assert config.fit.exposure == "off"
+    assert config.motion.learn_offset != ("offset" in sentence)
+    assert (config.fit.exposure == "off") == ("exposure" in sentence)
     assert (out / "leave-out.png").stat().st_size > 10_000
 
 
