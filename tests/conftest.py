@@ -5,6 +5,7 @@ textured planes.
 from __future__ import annotations
 
 import json
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,15 +27,17 @@ from tests.scenes import textured
 from tests.scenes.gaussians import NEW_ATTRIBUTES
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
-mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
+# One for all tests, which then share its kernels; on a machine with a GPU it may be cuda_ad_rgb.
+VARIANT = os.environ.get("MORGS_MI_TEST_VARIANT", "llvm_ad_rgb")
+mi.set_variant(VARIANT)
 
 
 @pytest.fixture(autouse=True)
-def llvm_variant():
+def one_variant():
     """Restore the variant after every test."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     yield
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
 
 
 @pytest.fixture

@@ -383,7 +383,8 @@ def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_diction
     scene = mi.load_file(str(tmp_path / "scene.xml"))
     image = np.asarray(mi.render(scene, sensor=mi.load_dict(make_sensor_camera().sensor())))
     assert image.shape[2] == 3 + 4
-    assert_close(image, expected, atol=tol.IMAGE_ABS)
+    # The last channel is a depth of about 3.
+    assert_close(image, expected, atol=tol.IMAGE_ABS, rtol=tol.SUM_ORDER_REL)
 
 
 @pytest.mark.slow

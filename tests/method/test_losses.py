@@ -122,7 +122,7 @@ def test_flow_loss__is_the_mean_endpoint_error():
 
 
 def test_flow_loss__has_a_finite_gradient_where_both_agree():
-    x = dr.ones(mi.TensorXf, (4, 4, 2))
+    x = from_numpy(mi.TensorXf, np.ones((4, 4, 2), np.float32))
     dr.enable_grad(x)
     dr.backward(flow_loss(x, dr.ones(mi.TensorXf, (4, 4, 2)), dr.ones(mi.TensorXf, (4, 4)), 16))
     assert np.asarray(dr.grad(x)).max() == 0

@@ -188,6 +188,7 @@ def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
         )
 
 
+@pytest.mark.skipif("llvm" not in mi.variant(), reason="a GPU sums in no fixed order")
 @pytest.mark.parametrize("count", [1, 400])
 @pytest.mark.parametrize("size", [(120, 90), (9, 5), (2900, 2200)])
 def test_rasterize__gradients_have_the_same_bytes_in_each_run(count, size):
