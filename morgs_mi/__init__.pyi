@@ -16,10 +16,13 @@ from .extras.live.sources import live_frames
 from .extras.sweep.sweep import leave_out, sweep
 from .extras.synth.synth_config import SynthConfig
 from .extras.synth.synthesize import synthesize
-from .fit.fit_config import FitConfig
-from .gaussian_integrator import ellipsoids
+from .fit.density import DensityControl
+from .fit.fit_config import DensityConfig, FitConfig
+from .fit.initialise import from_points
+from .gaussian_integrator import ellipsoids, update_ellipsoids
 from .io.ply import write_ply
 from .io.splats import read_splats
+from .loop.first_frame import fit_gaussians
 from .loop.frame_report import FrameReport
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
@@ -39,6 +42,8 @@ __all__ = [
     "Camera",
     "Capture",
     "CodecConfig",
+    "DensityConfig",
+    "DensityControl",
     "FitConfig",
     "FrameReport",
     "Gaussians",
@@ -57,6 +62,8 @@ __all__ = [
     "depth_image",
     "ellipsoids",
     "evaluate_stream",
+    "fit_gaussians",
+    "from_points",
     "leave_out",
     "light_probe",
     "live_frames",
@@ -75,6 +82,7 @@ __all__ = [
     "stream_capture",
     "sweep",
     "synthesize",
+    "update_ellipsoids",
     "with_near_planes",
     "write_ply",
 ]

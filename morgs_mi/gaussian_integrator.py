@@ -39,6 +39,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.attributes import shape_attribute_widths
+from morgs_mi.core.checks import require
 from morgs_mi.core.extras import places
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy, owned_copy
@@ -87,6 +88,35 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
         )
         for name, value in {"data": data, **values}.items()
     }
+
+
+def update_ellipsoids(params: Any, gaussians: ActivatedGaussians, shape: str = "gaussians") -> None:
+    """Write N Gaussians into an `ellipsoids` shape of a scene and update it; gradients of its
+    images reach them.
+
+    Args:
+        params: of the scene, from `mi.traverse`.
+        gaussians: N Gaussians; N may have changed.
+        shape: name of the shape.
+
+    Raises:
+        ValueError: the scene has no such shape.
+    """
+    require(
+        f"{shape}.data" in params,
+        "update_ellipsoids()",
+        f"`params` must have {shape}.data",
+        "none",
+        "name the shape that morgs_mi.ellipsoids() made",
+    )
+    quats: Any = gaussians.quats
+    length = dr.maximum(dr.sum(dr.square(quats), axis=1), 1e-30)
+    xyzw = (quats * dr.rsqrt(length)[:, None])[:, mi.UInt32(1, 2, 3, 0)]
+    params[f"{shape}.data"] = dr.concat([gaussians.means, gaussians.scales, xyzw], axis=1).array
+    for name in shape_attribute_widths():
+        if f"{shape}.{name}" in params and getattr(gaussians, name, None) is not None:
+            params[f"{shape}.{name}"] = getattr(gaussians, name).array
+    params.update()
 
 
 def integrator(plugin: str, props: Any) -> Any:

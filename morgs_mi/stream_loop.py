@@ -253,7 +253,8 @@ class StreamLoop:
 
     def __repr__(self) -> str:
         count = len(self.setup.cameras)
-        return f"StreamLoop({count} cameras, frame {self.state.frame} is next, {self.gaussians})"
+        gaussians = "" if self.gaussians is None else f", {self.gaussians}"
+        return f"StreamLoop({count} cameras, frame {self.state.frame} is next{gaussians})"
 
     @property
     def gaussians(self) -> Gaussians | None:

@@ -23,21 +23,13 @@ from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.testing import mitsuba_variant  # noqa: F401
 from tests.scenes import textured
 from tests.scenes.gaussians import NEW_ATTRIBUTES
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
-# One for all tests, which then share its kernels; on a machine with a GPU it may be cuda_ad_rgb.
-VARIANT = os.environ.get("MORGS_MI_TEST_VARIANT", "llvm_ad_rgb")
-mi.set_variant(VARIANT)
-
-
-@pytest.fixture(autouse=True)
-def one_variant():
-    """Restore the variant after every test."""
-    mi.set_variant(VARIANT)
-    yield
-    mi.set_variant(VARIANT)
+# One for all tests, which then share its kernels.
+mi.set_variant(os.environ.get("MORGS_MI_TEST_VARIANT", "llvm_ad_rgb"))
 
 
 @pytest.fixture

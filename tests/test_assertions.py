@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 
 
 def test_assert_close__accepts_errors_up_to_the_tolerances():
@@ -19,12 +19,8 @@ def test_assert_close__accepts_errors_up_to_the_tolerances():
 @pytest.mark.parametrize(
     ("value", "expected", "message"),
     [
-        (
-            [[1, 2], [3, 5]],
-            [[1, 2], [3, 4]],
-            r"x: off by 1 at \[1, 1\] \(found 5, expected 4\), bound 0.5; 1 of 4",
-        ),
-        ([1, np.nan], [1, 2], r"off by nan at \[1\]"),
+        ([[1, 2], [3, 5]], [[1, 2], [3, 4]], r"x\n(.|\n)*\[1, 1\]: 5"),
+        ([1, np.nan], [1, 2], r"x\n(.|\n)*nan"),
         ([1, 2], [1, 2, 3], r"x: shape \[2\], expected \[3\]"),
     ],
 )

@@ -20,6 +20,8 @@ EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 SIZES = {
     "optimise": (3 * 96, 96),
     "fit_cameras": (4 * 96, 72),
+    "fit_sensors": (2 * 160, 120),
+    "own_fit": (2 * 160, 120),
     "own_loss": (2 * 96, 72),
     "meshes": (240, 160),
 }
@@ -43,7 +45,17 @@ def test_examples__are_short():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SIZES)
+def test_examples__fit_alike_by_a_call_and_by_a_loop(tmp_path):
+    scores = []
+    for name in ("fit_sensors", "own_fit"):
+        truth, image = np.split(run(name, tmp_path / "picture.png") / 255, 2, axis=1)
+        scores.append(-10 * np.log10(np.square(image - truth).mean()))
+    assert min(scores) > 38
+    assert abs(scores[0] - scores[1]) < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in SIZES if name not in ("fit_sensors", "own_fit")])
 def test_examples__write_a_picture(name, tmp_path, monkeypatch):
     # `own_loss` registers a term for the whole process.
     registry = Registry("ObjectiveConfig()", "terms", objective.ObjectiveConfig)

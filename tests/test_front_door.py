@@ -87,7 +87,7 @@ def test_front_door__reprs_are_short():
         ),
         (
             morgs_mi.StreamLoop(look_at_cameras(QUAD), [], []),
-            "StreamLoop(4 cameras, frame 0 is next, None)",
+            "StreamLoop(4 cameras, frame 0 is next)",
         ),
     ):
         assert repr(value) == text

@@ -13,8 +13,8 @@ from morgs_mi.method.losses import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.quick import NO_DENSITY, quick
 from tests.scenes import surfaces
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views

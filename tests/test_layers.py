@@ -15,6 +15,7 @@ import morgs_mi
 ROOT = Path(morgs_mi.__file__).parent
 SUBPACKAGES = (
     "core",
+    "testing",
     "io",
     "render",
     "surfaces",

@@ -10,11 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
 from morgs_mi.core.checks import LARGEST, bounded, check_number, check_size, numbers, require
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.types import Tensor
 
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
@@ -39,6 +41,9 @@ class Camera:
         delay: frames by which its images are later than the timestamps of the recording, at the
             middle row. Gaussians with motion are rendered where they are then.
         readout: frames between the exposures of the first and the last row; 0 for a global shutter.
+        background: image [H, W, 3] behind all Gaussians in this view, in the colours of its images:
+            uint8, or floats with 1 for white. It is copied. None: the colour of the renderer's
+            settings.
 
     Example:
         >>> size = {"width": 320, "height": 240}
@@ -60,6 +65,7 @@ class Camera:
     near: float = 0.01
     delay: float = 0.0
     readout: float = 0.0
+    background: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
@@ -88,6 +94,17 @@ class Camera:
             require(shape == (4, 4), where, "`viewmat` must be [4, 4]", shape, "pass one camera's")
         else:
             viewmat = rigid(f"{where}, `viewmat`", numbers(where, "viewmat", viewmat, 4, 4))
+        if self.background is not None:
+            size = (self.height, self.width, 3)
+            image = numbers(where, "background", self.background, *size)
+            require(
+                image.dtype == np.uint8 or bounded(image),
+                where,
+                "`background` must be finite",
+                "NaN or values above 1e12",
+                "paint the pixels without one",
+            )
+            object.__setattr__(self, "background", unit_values(image, np.float32))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
 
@@ -141,6 +158,11 @@ class Camera:
         viewmat = np.vstack([np.column_stack([R, -R @ origin]), [0, 0, 0, 1.0]])
         K = intrinsics_of_fov(fov_x, width, height)
         return cls(K, viewmat, width, height, name, near=min(0.01, float(distance) / 100))
+
+    @classmethod
+    def of(cls, view: Any) -> Camera:
+        """Return a camera as it is, or the one of a Mitsuba sensor (see `from_sensor`)."""
+        return view if isinstance(view, Camera) else cls.from_sensor(view)
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Camera:
@@ -245,7 +267,10 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""
         K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
-        return replace(self, K=K, width=width, height=height)
+        image = self.background
+        if image is not None:
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return replace(self, K=K, width=width, height=height, background=image)
 
     def with_width(self, width: int) -> Camera:
         """Return the same view with images of another width and the same aspect ratio.

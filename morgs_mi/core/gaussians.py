@@ -265,16 +265,33 @@ class Gaussians:
         values = {**self.items(), "sh_dc": sh_dc, "sh_rest": sh_rest}
         return {a.name: values[a.name] for a in ATTRIBUTES if values.get(a.name) is not None}
 
+    @classmethod
+    def from_parameters(cls, parameters: Mapping[str, Tensor]) -> Gaussians:
+        """Return Gaussians with `parameters`, such as those of an optimiser; other names are left
+        out. Gradients reach them.
+
+        Raises:
+            ValueError: one that all Gaussians have is missing, or as for `Gaussians`.
+        """
+        names = [a.name for a in ATTRIBUTES]
+        required = ("means", "log_scales", "quats", "logit_opacities", "sh_dc")
+        missing = [name for name in required if name not in parameters]
+        require(
+            not missing,
+            "Gaussians.from_parameters()",
+            f"`parameters` must have {', '.join(required)}",
+            f"none of the name {', '.join(missing)}",
+            "see Gaussians.parameters()",
+        )
+        return cls(**_raw_attributes({n: parameters[n] for n in names if n in parameters}))
+
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
         """Return these Gaussians with some of their `parameters` replaced.
 
         Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree
         becomes 0.
         """
-        values = dict(parameters)
-        if "sh_dc" in values:
-            values["sh_coeffs"] = join_sh(values.pop("sh_dc"), values.pop("sh_rest", None))
-        return replace(self, **values)
+        return replace(self, **_raw_attributes(parameters))
 
     def items(self) -> dict[str, Tensor]:
         """Return the raw attributes that are present, by the names of the fields."""
@@ -332,6 +349,14 @@ def split_sh(sh_coeffs: Tensor) -> tuple[Tensor, Tensor | None]:
     """
     K = int(sh_coeffs.shape[1])
     return (sh_coeffs, None) if K == 1 else (sh_coeffs[:, :1], sh_coeffs[:, 1:])
+
+
+def _raw_attributes(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return parameters with the spherical harmonics in one part, where they are given."""
+    values = dict(parameters)
+    if "sh_dc" in values:
+        values["sh_coeffs"] = join_sh(values.pop("sh_dc"), values.pop("sh_rest", None))
+    return values
 
 
 def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:

@@ -145,8 +145,8 @@ def accuracy(
     Raises:
         ValueError: as `rasterize`.
     """
-    config = config or RenderConfig()
-    camera = replace(camera, delay=0, readout=0)
+    config = replace(config or RenderConfig(), background=None)
+    camera = replace(camera, delay=0, readout=0, background=None)
     gaussians = Gaussians(**gaussians.numpy())
     tensors = [getattr(gaussians, name) for name in ATTRIBUTES]
     dr.enable_grad(tensors)

@@ -20,13 +20,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from drjit.opt import Adam
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import require
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.initialise import in_empty_space
+from morgs_mi.fit.optimise import select_rows, values_of
+from morgs_mi.method.error_per_gaussian import densification_scores
+from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.render_config import RenderConfig
 
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
@@ -139,6 +148,136 @@ def plan_additions(
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(is_birth, _logit(_BIRTH_OPACITY) - logits, 0)
     return _plan(gaussians, survivors, parents, np.where(is_birth, _LOG_SHRINK, 0), fainter, rng)
+
+
+class DensityControl:
+    """Clones, splits and prunes Gaussians while they are optimised (see `density`).
+
+    The optimiser, `mi.ad.Adam` or `drjit.opt.Adam`, has raw attributes by their names in
+    `Gaussians.parameters`, and may have others with a row for each Gaussian.
+
+    Args:
+        cameras: training views, `Camera`s or `perspective` sensors; Gaussians in the empty space
+            before them are pruned.
+        config: thresholds.
+        extent: of the scene, world units; None: of the cameras.
+        seed: of the means of births, or a generator.
+        render: cut-offs of the renderer.
+
+    Attributes:
+        extent: of the scene, world units.
+        scores: densification scores [N] since the last step, by which parents are chosen; may be
+            set, such as to gradients of projected means (`means2d` of `rasterize`). None: none yet.
+
+    Example:
+        >>> optimizer = mi.ad.Adam(lr=0.01, params=gaussians.parameters())
+        >>> control = morgs_mi.DensityControl(cameras)
+        >>> ...  # some steps
+        >>> for camera, image in zip(cameras, images):
+        ...     control.observe(optimizer, camera, image)
+        >>> plan = control.step(optimizer, births=1000)
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Any] = (),
+        config: DensityConfig | None = None,
+        extent: float | None = None,
+        seed: int | np.random.Generator = 0,
+        render: RenderConfig | None = None,
+    ) -> None:
+        self._cameras = [Camera.of(camera) for camera in cameras]
+        require(
+            cameras or extent is not None,
+            "DensityControl()",
+            "`cameras` or `extent` must be given",
+            "neither",
+            "pass the training views",
+        )
+        self._config = config or DensityConfig()
+        self.extent = scene_extent(self._cameras) if extent is None else extent
+        self._rng = np.random.default_rng(seed)
+        self._render = render or RenderConfig()
+        self.scores: np.ndarray | None = None
+
+    def observe(
+        self, optimizer: Adam, camera: Any, image: np.ndarray, mask: np.ndarray | None = None
+    ) -> None:
+        """Render a view, and attribute its error to the Gaussians that cause it.
+
+        Args:
+            optimizer: holds the Gaussians.
+            camera: a `Camera` or a `perspective` sensor.
+            image: the recorded image [H, W, 3], sRGB-encoded: uint8, or floats with 1 for white.
+            mask: valid pixels [H, W], bool; None: all are.
+        """
+        view = ActiveView(Camera.of(camera), self._render)
+        gaussians = Gaussians.from_parameters(values_of(optimizer))
+        self.observe_views(gaussians, [view], [Target(image, mask)])
+
+    def observe_views(
+        self, gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]
+    ) -> None:
+        """Render views and attribute their errors to N Gaussians, see `densification_scores`."""
+        scores = densification_scores(gaussians, views, targets)
+        self.scores = scores if self.scores is None else np.maximum(self.scores, scores)
+
+    def step(self, optimizer: Adam, births: int) -> DensityPlan:
+        """Prune what is faint, and clone or split the Gaussians with the largest scores.
+
+        Adam's moments are carried over; those of births are 0.
+
+        Args:
+            optimizer: holds the Gaussians, whose number may change.
+            births: largest number of births.
+
+        Returns:
+            What was done, as indices of the Gaussians before.
+
+        Raises:
+            ValueError: an attribute is missing, or the scores are of another number of Gaussians.
+        """
+        gaussians = Gaussians.from_parameters(values_of(optimizer))
+        plan = plan_growth(
+            gaussians,
+            self._taken_scores(len(gaussians)),
+            births,
+            self.extent,
+            self._config,
+            self._rng,
+            self._cameras,
+        )
+        del gaussians  # tensors that the next steps would keep in memory
+        select_rows(optimizer, plan.parent, plan.source < 0, plan.edits)
+        return plan
+
+    def step_later(self, optimizer: Adam, gaussians: Gaussians, num_static: int) -> DensityPlan:
+        """Prune what is faint, and add small faint Gaussians where the scores are largest, as a
+        later frame does; the optimiser has a residual, which births share with their parents.
+
+        Args:
+            optimizer: holds the residual.
+            gaussians: N active Gaussians after it.
+            num_static: number of the other Gaussians.
+        """
+        plan = plan_additions(
+            gaussians, self._taken_scores(len(gaussians)), self._config, self._rng, num_static
+        )
+        select_rows(optimizer, plan.parent, plan.source < 0)
+        return plan
+
+    def _taken_scores(self, count: int) -> np.ndarray:
+        """Return the scores, which are used once."""
+        scores = np.zeros(count) if self.scores is None else np.asarray(self.scores)
+        require(
+            scores.shape == (count,),
+            "DensityControl.step()",
+            f"`scores` must be [{count}], one for each Gaussian",
+            list(scores.shape),
+            "observe the Gaussians that the optimiser has now",
+        )
+        self.scores = None
+        return scores
 
 
 def _survivors(visible: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.density import plan_growth
+from morgs_mi.fit.density import DensityControl
 from morgs_mi.fit.dropout import dropped
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import (
@@ -30,13 +30,11 @@ from morgs_mi.fit.optimise import (
     adam,
     optimise,
     replace_parameter,
-    select_rows,
     values_of,
     view_order,
 )
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import half_sized
-from morgs_mi.method.error_per_gaussian import densification_scores
 from morgs_mi.method.losses import mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
@@ -105,6 +103,7 @@ def fit_first_frame(
         image = views[view].render(gaussians, ("color",))
         return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
 
+    control = DensityControl(problem.cameras, config.density, problem.extent, rng)
     losses = {}
     order = iter(view_order(len(views), steps, rng))
     for first, stop in pairwise(sorted({0, *bands, *rounds, steps})):
@@ -118,18 +117,10 @@ def fit_first_frame(
                 targets = [Target(view.image, view.mask) for view in problem.views]
             gaussians = start.with_parameters(values_of(optimizer))
             missing = max(config.planned_gaussians - len(gaussians), 0)
-            plan = plan_growth(
-                gaussians,
-                densification_scores(gaussians, views, targets),
-                -(-missing // (len(rounds) - rounds.index(first))),
-                problem.extent,
-                config.density,
-                rng,
-                problem.cameras,
-            )
+            control.observe_views(gaussians, views, targets)
             del gaussians  # tensors that the next steps would keep in memory
-            select_rows(optimizer, plan.parent, plan.source < 0, plan.edits)
-            start = start.select(plan.parent)
+            births = -(-missing // (len(rounds) - rounds.index(first)))
+            start = start.select(control.step(optimizer, births).parent)
         chunk = Steps(
             islice(order, stop - first),
             first,

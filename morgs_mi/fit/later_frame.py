@@ -14,9 +14,9 @@ from morgs_mi.core.gaussians import Gaussians, at_rest, displaced
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.density import apply_plan, plan_additions
+from morgs_mi.fit.density import DensityControl, apply_plan
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.optimise import Steps, adam, optimise, select_rows, values_of, view_order
+from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.losses import recon_loss
@@ -178,13 +178,13 @@ def fit_later_frame(
         # An epoch has shown where to add Gaussians.
         if scores is not None and (has_converged or epochs >= latest_density_epoch):
             num_static = len(problem.previous) - len(active.indices)
-            errors = np.asarray(scores.scores)
-            plan = plan_additions(gaussians(), errors, config.density, rng, num_static)
+            control = DensityControl((), config.density, problem.extent, rng)
+            control.scores = np.asarray(scores.scores)
+            plan = control.step_later(optimizer, gaussians(), num_static)
             # The optimiser has the residual, so the plan changes the previous Gaussians: a birth
             # starts from the past of its parent, and shares its residual.
             previous = apply_plan(previous, plan)
             source = plan.source
-            select_rows(optimizer, plan.parent, plan.source < 0)
             shared = {}
             scores = None
             awaits_density_round = False

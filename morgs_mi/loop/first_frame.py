@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.codec.container import Packet
-from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.codec.packets import decode, keyframe_packet
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.progress import Progress
+from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.balance import balance_cameras, balance_config
 from morgs_mi.fit.budget import plan_first_frame
@@ -23,12 +25,64 @@ from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.observation import FrameObservation, Images, Setup, views_of
+from morgs_mi.loop.input_images import Frame
+from morgs_mi.loop.observation import (
+    FrameObservation,
+    ImageHistory,
+    Images,
+    Setup,
+    observe_frame,
+    prepare,
+    views_of,
+)
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
 
 _LOG = logging.getLogger(__name__)
+
+
+@interrupts_raised()
+def fit_gaussians(
+    sensors: Sequence[Any],
+    images: Frame,
+    points: np.ndarray | None = None,
+    point_colors: np.ndarray | None = None,
+    config: StreamConfig | None = None,
+    masks: Sequence[np.ndarray | None] | None = None,
+    progress: Report | None = None,
+) -> Gaussians:
+    """Return Gaussians fitted to images of one timestamp, as `StreamLoop` fits its first frame:
+    with its starts, balance of the cameras, density control and dropout. They equal
+    `loop.gaussians` after that frame.
+
+    Args:
+        sensors: V views, `Camera`s or Mitsuba's `perspective` sensors.
+        images: an image [H, W, 3] per view: uint8 in sRGB, linear light as a float array or a
+            `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. A dict has them by the
+            names of the views.
+        points: [P, 3] of the scene, world units; None, or fewer than 20: random ones inside the
+            views.
+        point_colors: [P, 3], encoded: 1 is white; None: grey.
+        config: settings; those of the first frame and the renderer count.
+        masks: per view [H, W] bool of valid pixels, or None.
+        progress: called with (stage, done, total).
+
+    Example:
+        >>> gaussians = morgs_mi.fit_gaussians(scene.sensors(), [mi.render(scene, sensor=s)
+        ...                                                      for s in scene.sensors()])
+
+    Raises:
+        ValueError: as for `StreamLoop` and `StreamLoop.push`.
+    """
+    points = np.zeros((0, 3)) if points is None else points
+    point_colors = np.full(np.shape(points), 0.5) if point_colors is None else point_colors
+    cameras = [Camera.of(sensor) for sensor in sensors]
+    setup = prepare(cameras, points, point_colors, config, masks)
+    observed = observe_frame(setup, 0, ImageHistory(), images)
+    packet, _ = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
+    return decode(None, packet).gaussians
 
 
 def fitted_first_frame(

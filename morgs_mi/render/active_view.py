@@ -6,17 +6,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import touches
 from morgs_mi.render.projection import Splats, project
-from morgs_mi.render.rasterize import Image, rasterize
+from morgs_mi.render.rasterize import Image, backdrops, rasterize
 from morgs_mi.render.region import BlockGrid, Region
 from morgs_mi.render.render_config import RenderConfig
 
@@ -45,12 +48,19 @@ class ActiveView:
             gaussians,
             self.camera,
             channels,
+            self._background,
             detach_weights=detach_weights,
             region=self.region,
             features=features,
             static_splats=self.static_splats,
             config=self.config,
         )
+
+    @cached_property
+    def _background(self) -> Tensor | None:
+        """The camera's image behind the drawn pixels; None without one."""
+        images = backdrops([self.camera], self.config)
+        return None if images is None else from_numpy(mi.TensorXf, self.crop(images[0]))
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return the drawn pixels of an image [H, W, ...] of the view."""

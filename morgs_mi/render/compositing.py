@@ -28,6 +28,7 @@ def blend(
     region: Region,
     lists: BlockLists,
     layout: Layout,
+    absolute: tuple[Float, ...] = (),
 ) -> list[Float]:
     """Blend every channel's columns over a region.
 
@@ -37,6 +38,8 @@ def blend(
         region: the blocks that are drawn.
         lists: the splats that touch them, built from the same geometry and columns.
         layout: sizes of the channels, whether their gradients reach the weights, and cut-offs.
+        absolute: two columns that are not read, and whose gradients are the sums of the absolute
+            gradients of the means over the pixels; none without `layout.absolute`.
 
     Returns:
         The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one
@@ -44,7 +47,7 @@ def blend(
         used further. Differentiable in `geometry` and `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
-    return dr.custom(_Blend, [*geometry, *columns], region, lists, layout)
+    return dr.custom(_Blend, [*geometry, *columns, *absolute], region, lists, layout)
 
 
 class _Blend(dr.CustomOp):
@@ -72,11 +75,12 @@ class _Blend(dr.CustomOp):
             grads = [*grads, alpha + coverage]
         grads = [padded(v, self.region, size) for v, size in zip(grads, layout.sizes, strict=True)]
         columns = record_gradients(self.lists, layout, self.images, grads)
-        missing = layout.geometry + layout.columns - len(columns)
+        missing = layout.geometry + layout.columns + 2 * layout.absolute - len(columns)
         self.set_grad_in("values", [mi.Float(0)] * missing + columns)
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
+        grads = grads[: self.layout.geometry + self.layout.columns]
         tangents = pack_records(grads, self.lists.by_depth_order)
         images = recorded(tangent, self.layout)(self.lists, tangents, self._allocated())
         self.set_grad_out(self._outputs(images))
@@ -99,7 +103,8 @@ class _Blend(dr.CustomOp):
 def record_gradients(
     lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
 ) -> list[Float]:
-    """Return the gradients of the geometry (if the layout reaches it) and the columns, floats [N].
+    """Return the gradients of the geometry (if the layout reaches it) and the columns, and the
+    absolute gradients of the means (if the layout has them), floats [N].
 
     The gradients of columns that do not reach the weights are the sums of `grads`, weighted by each
     splat's blend weights; they do not depend on `images`.
@@ -135,7 +140,8 @@ def record_gradients(
     dr.eval(sums)
     lane = lists.depth_order_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
-    return [elements(sums, lane + k) for k in range(start, layout.geometry + layout.columns)]
+    stop = layout.geometry + layout.columns + 2 * layout.absolute
+    return [elements(sums, lane + k) for k in range(start, stop)]
 
 
 def _cropped(image: Float, region: Region, size: int) -> Float:

@@ -58,6 +58,8 @@ class Layout:
     alpha_attached: bool  #: Whether the gradient of alpha is wanted.
     config: RenderConfig  #: Cut-offs.
     cut: bool = False  #: Whether every pixel has a depth limit.
+    #: Whether the adjoint also sums the absolute gradients of the means over the pixels.
+    absolute: bool = False
 
     @property
     def geometry(self) -> int:
@@ -86,8 +88,8 @@ class Layout:
 
 
 def record_packets(layout: Layout) -> int:
-    """Return the number of packets of 4 floats of a Gaussian's record, and of its gradient."""
-    return -(-(layout.geometry + layout.columns) // 4)
+    """Return the number of packets of 4 floats of a Gaussian's gradient."""
+    return -(-(layout.geometry + layout.columns + 2 * layout.absolute) // 4)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -281,7 +283,8 @@ def adjoint(
     sums: Float,
 ) -> Float:
     """Add dL/d(record) to `sums`, which has a record of each Gaussian by depth order: the
-    geometry's floats, the columns, padding.
+    geometry's floats, the columns, the two absolute gradients of the mean if the layout has them,
+    padding.
 
     Args:
         layout: description of the blend.
@@ -314,6 +317,7 @@ def adjoint(
         S_next = []
         value_grads = _floats(C)
         moments = _Moments(block)
+        absolute = _floats(2 * layout.absolute)
         for k, (p, u) in enumerate(block.powers(dx, dy, geometry)):
             alpha, full = block.alpha(p)
             part = cut.alpha(k, alpha) if cut else None
@@ -332,13 +336,21 @@ def adjoint(
                     d = alpha * part.by_alpha * d_alpha
                 else:
                     d = dr.fma(w, gc, -alpha * s * dr.rcp(1 - alpha))
-                moments.add(k, dr.select(full <= layout.config.alpha_max, d, 0), u)
+                d = dr.select(full <= layout.config.alpha_max, d, 0)
+                moments.add(k, d, u)
+                if layout.absolute:
+                    _, _, a, b, c, _ = geometry[:_SHAPE]
+                    by_mean = a * u, dr.fma(b, u, c * c * dy[k // block.width])
+                    absolute = [
+                        total + 2 * _LN2 * dr.abs(d * slope)
+                        for total, slope in zip(absolute, by_mean, strict=True)
+                    ]
         geometry_grads = moments.gradients(dx[0], dy[0], geometry) if geometric else _floats(G)
         if cut and geometric:
             mean_grads, profile_grads = cut.gradients()
             total_grads = [a + b for a, b in zip(geometry_grads, mean_grads, strict=False)]
             geometry_grads = [*total_grads, *geometry_grads[2:], *profile_grads]
-        grads = [*geometry_grads, *value_grads]
+        grads = [*geometry_grads, *value_grads, *absolute]
         grads += _floats(packets * 4 - len(grads))
         for k in range(packets):
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])

@@ -13,7 +13,7 @@ import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import OF_SENSOR, Camera
-from morgs_mi.core.checks import check_type, numbers
+from morgs_mi.core.checks import check_type, kind_of, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
 from morgs_mi.core.png import png_bytes
@@ -100,6 +100,7 @@ def rasterize(
     static_splats: Splats | None = None,
     config: RenderConfig | None = None,
     depth_limit: Tensor | np.ndarray | None = None,
+    means2d: Tensor | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
 
@@ -114,8 +115,9 @@ def rasterize(
             without the learned offset), and the channels of the table of attributes
             (``confidence``). Colour and the channels of attributes are sums weighted by T alpha;
             depth and motion are divided by the sum of those weights.
-        background: display-referred colour [3] behind all Gaussians; None: black. A Dr.Jit array
-            gets gradients.
+        background: display-referred colour [3] behind all Gaussians, or an image of them in the
+            shape of the result's; None: the image of the camera, or the colour of `config`. A
+            Dr.Jit array gets gradients.
         detach_weights: channels with a gradient that reaches only the blended values, not opacity
             and geometry.
         region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its
@@ -129,6 +131,10 @@ def rasterize(
             ray, world units; inf where there is none. A Gaussian around that depth is drawn in
             part: by the fraction of its optical depth that the ray has passed. The limit gets no
             gradient. None: no limit, and no cost.
+        means2d: zeros [N, 4] with gradients enabled. `dr.backward` gives them the gradient with
+            respect to the projected mean in pixels (two columns), and the sums of its absolute
+            values over the pixels (two columns), by which density control may choose parents. Only
+            for one whole view without `static_splats` and `depth_limit`. None: no cost.
 
     Example:
         >>> image = morgs_mi.rasterize(gaussians, camera, channels=("color", "depth"))
@@ -160,6 +166,7 @@ def rasterize(
     cameras = tuple(camera) if is_stack else (camera,)
     options = {"background": background, "features": features, "config": config}
     options |= {"region": region, "static_splats": static_splats, "depth_limit": depth_limit}
+    options["means2d"] = means2d
     for problem in _problems(gaussians, cameras, channels, detach_weights, options, is_stack):
         raise ValueError(f"rasterize(): {problem}.")
     channels = tuple(dict.fromkeys(channels))
@@ -176,6 +183,11 @@ def rasterize(
         limits = dr.clip(depths.array, -FARTHEST, FARTHEST)
     if region is None:
         region = full_view(view.width, view.height, block_shape(config), len(cameras), mi.variant())
+    if background is None:
+        background = config.background
+        if (images := backdrops(cameras, config)) is not None:
+            background = np.stack(images) if is_stack else images[0]
+            background = background if region.whole else region.crop(images[0])
     stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
     cut = limits is not None
@@ -194,12 +206,18 @@ def rasterize(
         images = {name: dr.zeros(mi.TensorXf, (*stack, sizes[name])) for name in channels}
         if background is not None and "color" in images:
             zeros = dr.zeros(mi.Float, prod((*stack, 3)))
-            images["color"] = _tensor(_over(background, zeros, zeros), region, (*stack, 3))
+            images["color"] = _tensor(over(background, zeros, zeros), region, (*stack, 3))
         return _image(images)
     parts = [project(gaussians, part, projected, config, rows, features) for part in cameras]
     splats = parts[0] if len(parts) == 1 else _stacked(parts)
     if static_splats is not None:
         splats = splats.concatenated_with(static_splats)
+    absolute: Sequence[Float] = ()
+    if means2d is not None:
+        lane = dr.arange(mi.UInt32, len(splats)) * 4
+        x, y, *absolute = (dr.gather(mi.Float, means2d.array, lane + k) for k in range(4))
+        mean_x, mean_y, *others = splats.shape
+        splats = replace(splats, shape=(mean_x + x, mean_y + y, *others))
     dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
     _check_finite(splats.finite, gaussians, cameras, features)
     values = [splats.channels[name] for name in blended]
@@ -216,8 +234,9 @@ def rasterize(
         any(name not in detach_weights for name in read_alpha),
         config,
         cut,
+        means2d is not None,
     )
-    outputs = blend(splats.geometry, values, region, lists, layout)
+    outputs = blend(splats.geometry, values, region, lists, layout, tuple(absolute))
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
@@ -227,7 +246,7 @@ def rasterize(
             if name in NORMALISED:  # 0 where nothing is drawn
                 images[name] = dr.select(weight > 0, images[name] / dr.maximum(weight, 1e-8), 0)
             else:
-                images[name] = _over(background, images[name], weight)
+                images[name] = over(background, images[name], weight)
     return _image({name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels})
 
 
@@ -238,13 +257,26 @@ def _image(tensors: Mapping[str, Tensor]) -> Image:
     return Image(**channels, others=others)
 
 
-def _over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:
-    """Return a colour with the sum of its weights, composited over the background."""
+def backdrops(cameras: Sequence[Camera], config: RenderConfig) -> list[np.ndarray] | None:
+    """Return the image behind all Gaussians for each camera [H, W, 3]; None if no camera has one:
+    it is the colour of `config`.
+    """
+    if all(camera.background is None for camera in cameras):
+        return None
+    plain = np.zeros((cameras[0].height, cameras[0].width, 3), np.float32)
+    plain += config.background or (0, 0, 0)
+    return [plain if camera.background is None else camera.background for camera in cameras]
+
+
+def over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:
+    """Return flat colours with the sums of their weights, composited over the background."""
     color: Any = background
     if dr.is_array_v(color):
         behind = color.array if dr.is_tensor_v(color) else dr.ravel(color)
     else:
-        behind = from_numpy(mi.Float, np.asarray(color))
+        behind = from_numpy(mi.Float, np.asarray(color, np.float32).ravel())
+    if dr.width(behind) == dr.width(values):
+        return dr.fma(1 - weight, behind, values)
     # Numbers of their own: the gradient of one array would be added by all pixels to three places.
     red, green, blue = (elements(behind, mi.UInt32(k)) for k in range(3))
     component = dr.arange(mi.UInt32, dr.width(weight)) % 3
@@ -341,21 +373,12 @@ def _problems(
         remedy = "render a smaller image, or tiles, one camera each"
         check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
-    background, features, config, region, static_splats, depth_limit = options.values()
-    behind = np.asarray(dr.detach(background)).ravel() if dr.is_array_v(background) else background
-    if behind is not None and not (
-        np.shape(behind) == (3,)
-        and (np.abs(numbers("rasterize()", "background", behind)) <= FARTHEST).all()
-    ):
-        yield (
-            "`background` must be three finite numbers of at most 1e18, got "
-            f"{background!r}; pass a colour or None"
-        )
+    background, features, config, region, static_splats, depth_limit, means2d = options.values()
     check_type("rasterize()", "config", config, RenderConfig)
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
-    for name in ("region", "static_splats", "depth_limit"):
+    for name in ("region", "static_splats", "depth_limit", "means2d"):
         value = options[name]
         if is_stack and value is not None:
             yield (
@@ -398,6 +421,33 @@ def _problems(
                 f"blocks like the camera's and the config's, got {shape[0]}x{shape[1]} with "
                 f"{shape[2]}x{shape[3]}; build it for this camera with this config"
             )
+    if background is not None:
+        shape = (*[V] * is_stack, *(region.shape(3) if region else (view.height, view.width, 3)))
+        is_image = dr.is_tensor_v(background) and tuple(background.shape) == shape
+        values = background if is_image or not dr.is_array_v(background) else np.ravel(background)
+        # The pixels of a tensor are not read.
+        if not is_image and not (
+            np.shape(values) in ((3,), shape)
+            and (np.abs(numbers("rasterize()", "background", values)) <= FARTHEST).all()
+        ):
+            value = kind_of(values) if np.ndim(values) > 1 else repr(values)
+            yield (
+                "`background` must be three finite numbers of at most 1e18, or an image "
+                f"{list(shape)}, got {value}; pass a colour, an image or None"
+            )
+    if means2d is not None:
+        N = int(gaussians.means.shape[0])
+        if not dr.is_tensor_v(means2d) or tuple(means2d.shape) != (N, 4):
+            yield (
+                f"`means2d` must be a tensor of zeros [{N}, 4], got a {type(means2d).__name__} "
+                f"{list(np.shape(means2d))}; use dr.zeros(mi.TensorXf, ({N}, 4))"
+            )
+        for name in ("region", "static_splats", "depth_limit"):
+            if options[name] is not None:
+                yield (
+                    f"`{name}` must be None with `means2d`, got one; render the whole view of one "
+                    "camera"
+                )
 
 
 def _check_finite(

@@ -32,6 +32,8 @@ class RenderConfig:
     first_order_motion: bool = False
     """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the
     difference of two projections. The relative difference is motion in depth / depth."""
+    background: tuple[float, float, float] | None = None
+    """Colour behind all Gaussians, encoded: 1 is white. None: black."""
     block_width: Annotated[int, Ge(4), Le(16), MultipleOf(4)] | None = None
     """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4.
     None: 8 on the CPU, 4 on the GPU."""

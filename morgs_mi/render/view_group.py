@@ -26,6 +26,7 @@ from morgs_mi.render.compositing import Layout, blend, record_gradients
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import Splats, Views, project
+from morgs_mi.render.rasterize import backdrops, over
 from morgs_mi.render.region import Region, joined, quotient_and_rest
 
 
@@ -60,6 +61,14 @@ class ViewGroup:
         return np.concatenate(
             [region.crop(image) for region, image in zip(self.regions, images, strict=True)]
         )
+
+    @cached_property
+    def background(self) -> Sequence[float] | Float | None:
+        """Colour [3], or flat image of the group, behind all Gaussians; None: black."""
+        images = backdrops([view.camera for view in self.views], self.config)
+        if images is None:
+            return self.config.background
+        return from_numpy(mi.Float, np.ascontiguousarray(self.crop(images)).ravel())
 
     @with_render_lock
     def draw(self, gaussians: ActivatedGaussians) -> Drawing:
@@ -123,14 +132,19 @@ class Drawing:
         """Colour of the group's pixels, flat [A * block_height * block_width * 3]; 0 outside the
         views.
         """
-        if self.drawn is None:
-            return dr.zeros(mi.Float, 3 * self.group.region.num_pixels)
-        splats, lists = self.drawn
-        layout = Layout((Channel(3, True),), False, False, self.group.config)
+        behind = self.group.background
+        image = dr.zeros(mi.Float, 3 * self.group.region.num_pixels)
+        weight = [dr.zeros(mi.Float, self.group.region.num_pixels)]
         with dr.suspend_grad():
-            (image,) = blend(
-                splats.geometry, [splats.channels["color"]], self.group.region, lists, layout
-            )
+            if self.drawn is not None:
+                splats, lists = self.drawn
+                has_weight = behind is not None
+                layout = Layout((Channel(3, True),), has_weight, False, self.group.config)
+                image, *weight = blend(
+                    splats.geometry, [splats.channels["color"]], self.group.region, lists, layout
+                )
+            if behind is not None:
+                image = over(behind, image, repeat_each(weight[0], 3))
             if self.group.region.weights is not None:
                 image = image * repeat_each(self.group.region.weights, 3)
             dr.eval(image)

@@ -478,7 +478,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
                 self.warnings.add(key)
 
     def to_string(self) -> str:
-        return (
-            f"GaussianSplatIntegrator[\n  srgb_primitives = {self.srgb_primitives},\n"
-            f"  background = {self.background},\n  aovs = {self.aovs}\n]"
-        )
+        settings = {name: getattr(self.config, name) for name in _SETTINGS}
+        settings = {"aovs": self.aovs, "background": self.background, **settings}
+        settings |= {"srgb_primitives": self.srgb_primitives, "surfaces": self.surfaces}
+        lines = ",\n".join(f"  {name} = {value}" for name, value in settings.items())
+        return f"GaussianSplatIntegrator[\n{lines}\n]"

@@ -18,7 +18,7 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.extras.calibration.calibrate import calibrate
 from morgs_mi.io.video_writer import write_video
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import (
     FPS,

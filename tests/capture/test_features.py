@@ -18,7 +18,7 @@ from morgs_mi.capture.features import (
 from morgs_mi.capture.points import SharedFeatures, triangulate_points
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import seen_points
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes import textured
 from tests.scenes.cameras import look_at_cameras
 

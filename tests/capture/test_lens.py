@@ -8,7 +8,7 @@ import pytest
 
 from morgs_mi.capture.lens import Lens, opencv_lens, undistortion
 from morgs_mi.core.camera import Camera
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 
 WIDTH = 160
 HEIGHT = 120

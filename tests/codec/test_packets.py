@@ -17,7 +17,7 @@ from morgs_mi.codec.packets import (
     residual_packet,
 )
 from morgs_mi.core.gaussians import Gaussians
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.codec import plain_decoder
 from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, jittered, write
 

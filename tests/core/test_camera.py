@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.camera import Camera
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 
 
 @pytest.fixture(

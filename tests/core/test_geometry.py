@@ -14,8 +14,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, sh_basis
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.testing import assert_close
 from tests import reference
-from tests.assertions import assert_close
 
 R = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 

@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import check_near_planes, scene_extent, with_near_planes
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import arc, circle, look_at_cameras
 
 NO_POINTS = np.zeros((0, 3))

@@ -16,7 +16,7 @@ from morgs_mi.evaluate.motion3d import (
     rigid_motions,
     surface_ids,
 )
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 
 rng = np.random.default_rng(0)
 WIDTH = 40

@@ -18,7 +18,7 @@ from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.error_per_gaussian import densification_scores
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)

@@ -18,7 +18,7 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.fit.view import View, rendered
 from morgs_mi.method.objective import ObjectiveConfig
 from morgs_mi.render.active_view import ActiveView
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem, views
 
 NO_GROWTH = DensityConfig(rounds=0)

@@ -16,7 +16,7 @@ from morgs_mi.fit.optimise import (
     values_of,
     view_order,
 )
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 
 
 def bowl(values, view):

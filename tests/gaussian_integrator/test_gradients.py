@@ -11,9 +11,9 @@ import pytest
 
 from morgs_mi import RenderConfig, rasterize
 from morgs_mi.surfaces import gaussian_splat
+from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.gaussian_integrator.expected import expected_image, to_linear
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_sensor_camera

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.gaussian_integrator.expected import expected_image, to_linear
 from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.gaussians import ExtendedGaussians, make_unit_scene, to_gaussians

@@ -19,8 +19,8 @@ import pytest
 from morgs_mi import ellipsoids, rasterize
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.ply import write_ply
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.gaussian_integrator.expected import to_linear
 from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.gaussians import make_unit_scene, to_gaussians

@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from morgs_mi.io.splats import read_splats
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats
 
 

@@ -14,7 +14,7 @@ from morgs_mi import ellipsoids
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import read_ply, write_ply
 from morgs_mi.io.splats import read_splats
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import RAW, make_unit_scene, to_gaussians
 
 

@@ -7,7 +7,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.io.ply import read_ply
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.io.test_ply import random_gaussians, table
 
 N = 20

@@ -10,7 +10,7 @@ import pytest
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.splats import read_splats
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats
 
 RECORD = struct.Struct("<6f8B")

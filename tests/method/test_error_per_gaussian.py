@@ -13,7 +13,7 @@ from morgs_mi.method.error_per_gaussian import ErrorPerGaussian, densification_s
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.region import Region
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 

@@ -14,8 +14,8 @@ from morgs_mi.evaluate.metrics import ssim_map
 from morgs_mi.method.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 
 SIZE = (19, 23, 3)
 

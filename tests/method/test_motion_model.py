@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, moved, sparse_product
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import make_scene, to_gaussians
 
 RNG = np.random.default_rng(3)

@@ -10,7 +10,7 @@ import pytest
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.residual import apply_residual, residual_parameters
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import RAW, make_scene, to_gaussians
 
 OFF = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)

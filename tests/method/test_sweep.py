@@ -11,7 +11,7 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import MAPS, KeyImages
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.view_group import backproject
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 

@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import default_rig
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats
 
 

@@ -23,7 +23,7 @@ from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.export.web import write_web_folder
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.render.rasterize import rasterize
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.cli.conftest import run
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import rig, splats

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.playback import visualise
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 
 
 def test_motion_image__colours_are_as_documented():

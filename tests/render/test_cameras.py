@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.render.region import Region
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import make_scene, to_gaussians
 

@@ -10,8 +10,8 @@ import pytest
 
 from morgs_mi import rasterize
 from morgs_mi.render.region import Region
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.scenes.gaussians import (
     ExtendedGaussians,
     to_gaussians,

@@ -11,8 +11,8 @@ import pytest
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import make_scene, to_gaussians
 

@@ -11,9 +11,9 @@ from scipy.special import erf
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.projection import project
 from morgs_mi.render.region import Region
+from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.reference import rasterize_view
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import CHANNELS, RAW, isotropic, to_gaussians

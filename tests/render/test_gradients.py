@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, RenderConfig, rasterize
+from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, RenderConfig, rasterize
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.render.exact import (
     ATTRIBUTES,
     BACKGROUND,

@@ -11,8 +11,8 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import Region
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import (
@@ -175,7 +175,7 @@ def test_rasterize__agrees_with_the_reference_in_a_one_pixel_image(scene):
 
 BROKEN = np.where(np.arange(10)[:, None] == 3, np.nan, np.ones((10, 2)))
 FEATURES = r"`features` must be \[N, F\] with N=10 and F from 1 to 12"
-BACKGROUND = "`background` must be three finite numbers of at most 1e18, got"
+BACKGROUND = "`background` must be three finite numbers of at most 1e18, or an image"
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import BlockGrid, Region
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.scenes.cameras import make_wide_camera
 from tests.scenes.gaussians import CHANNELS, RAW, make_wide_scene
 

@@ -19,7 +19,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
 
 WIDTH = 62

@@ -12,8 +12,8 @@ import pytest
 
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
+from morgs_mi.testing import assert_close
 from tests import tolerances as tol
-from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import (
     COLOR,

@@ -12,7 +12,7 @@ from scipy.stats import norm
 from morgs_mi import Camera, Gaussians, RenderConfig, SplatRays, rasterize
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import psnr
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 
 

@@ -59,6 +59,11 @@ void main() {
 
 const POST_VERTEX = "varying vec2 at; void main() { at = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }";
 
+/** Settings of the fit's renderer. */
+interface Metadata {
+  config?: { render?: { background?: [number, number, number] | null } };
+}
+
 export class Splats {
   readonly renderer: THREE.WebGLRenderer;
   readonly spark: SparkRenderer;
@@ -77,6 +82,8 @@ export class Splats {
   private readonly target = new THREE.WebGLRenderTarget(1, 1, { type: THREE.HalfFloatType, depthBuffer: false });
   private readonly post: FullScreenQuad;
   private changed = true;
+  /** Colour behind all Gaussians. */
+  private readonly background = new THREE.Color(0x000000);
   /** Stops by which the colours are brightened before they are clipped at white. */
   private stops = 0;
 
@@ -84,7 +91,8 @@ export class Splats {
     // Colours are display-referred, and blended as they are.
     THREE.ColorManagement.workingColorSpace = THREE.SRGBColorSpace;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, depth: false });
-    this.renderer.setClearColor(0x000000, 1);
+    const behind = (metadata as Metadata).config?.render?.background;
+    if (behind) this.background.setRGB(...behind);
     this.spark = new SparkRenderer({
       renderer: this.renderer,
       ...rendererOptions(metadata),
@@ -144,6 +152,7 @@ export class Splats {
   draw(camera: THREE.PerspectiveCamera): void {
     if (!this.changed) return;
     this.changed = false;
+    this.renderer.setClearColor(this.displayedMode() === "color" ? this.background : 0x000000, 1);
     const direct = this.stops === 0 && this.mode === "color" && this.displayedMode() === "color";
     this.renderer.setRenderTarget(direct ? null : this.target);
     this.renderer.render(this.scene, camera);

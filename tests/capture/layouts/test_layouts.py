@@ -26,7 +26,7 @@ from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.capture.layouts.test_colmap import as_binary
 from tests.scenes import captures as layouts
 from tests.scenes.captures import (

@@ -14,7 +14,7 @@ import pytest
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.clips import size_of_clip
 from morgs_mi.capture.layouts.nerfstudio import READER
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
 from tests.scenes.captures import HEIGHT, WIDTH

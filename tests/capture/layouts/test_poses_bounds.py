@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.core.camera import Camera
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.core.test_files import tree
 from tests.scenes.full_disk import files_end_at
 

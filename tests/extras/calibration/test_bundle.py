@@ -17,7 +17,7 @@ from morgs_mi.extras.calibration.bundle import (
     undistorted,
 )
 from morgs_mi.fit.fit_config import CameraPriors
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.textured import rig
 

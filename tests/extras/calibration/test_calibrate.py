@@ -31,7 +31,7 @@ from morgs_mi.extras.calibration.calibrate import (
 )
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, check_rig
 from morgs_mi.io.video_writer import write_video
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes import textured
 from tests.scenes.captures import write_timed_video
 from tests.scenes.full_disk import files_end_at

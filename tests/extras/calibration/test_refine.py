@@ -28,7 +28,7 @@ from morgs_mi.fit.view import View, rendered, withheld_blocks
 from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.fit_capture import with_points
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic
 

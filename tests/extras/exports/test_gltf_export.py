@@ -14,7 +14,7 @@ import pytest
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.extras.exports.gltf_export import glb, gltf_axes, write_gltf
 from morgs_mi.render.rasterize import rasterize
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import rig, splats
 
 KHR = "KHR_gaussian_splatting"

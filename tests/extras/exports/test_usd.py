@@ -20,7 +20,7 @@ from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.extras.exports.gltf_export import gltf_axes
 from morgs_mi.extras.exports.usd import write_usd
 from morgs_mi.playback.export.formats import USD
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import rig, splats, write_stream
 from tests.scenes.full_disk import files_end_at
 

@@ -25,7 +25,7 @@ from morgs_mi.extras.imports.import_frames import (
     same_gaussians,
 )
 from morgs_mi.io.ply import write_ply
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.cli.commands import assert_refused
 from tests.cli.conftest import run
 from tests.scenes.changing_splats import splats

@@ -14,7 +14,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.clips import clip_of_camera
 from morgs_mi.extras.layouts.anipose import read_anipose
 from morgs_mi.io.video_writer import write_video
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import (
     DOT,

@@ -11,7 +11,7 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.extras.layouts.qualisys import read_qualisys
 from morgs_mi.io.video_writer import write_video
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import (
     COUNT,

@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi import Gaussians, light_probe, rasterize
 from morgs_mi.core.color_space import SH_C0, decode_light
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import mirrored, render, scene
 

@@ -10,7 +10,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize, shadow_ratio, shadowed
 from morgs_mi.core.color_space import decode_light, encode_light
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 
 EYE = (0, 3, 0)

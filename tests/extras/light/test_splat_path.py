@@ -15,7 +15,7 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.evaluate.metrics import psnr
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import (
     LAMP,

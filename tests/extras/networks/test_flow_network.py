@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi.extras.networks.flow_network import FlowNetwork
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.tiny_network import export, export_lookup, known_flow
 
 # Float32 sums of six products of up to 255 each.

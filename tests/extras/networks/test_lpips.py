@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.extras.networks.lpips import Lpips
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.tiny_network import squared_difference
 
 H = 12

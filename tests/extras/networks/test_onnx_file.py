@@ -14,7 +14,7 @@ import pytest
 from onnx.external_data_helper import set_external_data
 
 from morgs_mi.extras.networks.onnx_file import OnnxNetwork, imagenet_blob
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.tiny_network import export, write
 
 VALUES = 1024

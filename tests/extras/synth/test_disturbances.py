@@ -30,7 +30,7 @@ from morgs_mi.extras.synth.shapes import box
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.video import open_frames
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.extras.synth.frames import FPS
 
 ALL = Disturbances(0.5, 0.4, 0.1)

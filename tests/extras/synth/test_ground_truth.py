@@ -11,7 +11,7 @@ from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.extras.synth.ground_truth import compute_ground_truth
 from morgs_mi.extras.synth.path_tracer import PathTracer
 from morgs_mi.extras.synth.scene import Object, Scene, load_scene, translate
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.extras.synth.frames import render_frame
 
 

@@ -9,7 +9,7 @@ import pytest
 from morgs_mi.extras.synth.ground_truth import compute_ground_truth
 from morgs_mi.extras.synth.path_tracer import PathTracer
 from morgs_mi.extras.synth.scene import Light, Scene
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import shift_principal_point
 
 

@@ -11,10 +11,10 @@ import pytest
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
+from morgs_mi.testing import assert_close
 
 # Not tests.scenes.
 from scenes.random import MOTIONS, Body, RandomScene, draw_scene  # pyright: ignore[reportMissingImports]
-from tests.assertions import assert_close
 
 NUM_SEEDS = 50
 FPS = 30.0

@@ -10,7 +10,7 @@ import pytest
 
 from morgs_mi.extras.synth.path_tracer import PathTracer
 from morgs_mi.extras.synth.scene import load_scene
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.extras.synth.frames import render_frame
 
 

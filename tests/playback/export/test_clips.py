@@ -23,7 +23,7 @@ from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_forma
 from morgs_mi.playback.export.frames import exr_channels, pad_to_even
 from morgs_mi.playback.export.web import write_web_folder
 from morgs_mi.render.rasterize import rasterize
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.codec.forge import forged_streams
 from tests.scenes.changing_splats import rig, write_stream
 from tests.scenes.short_clip import FRAMES, short_clip

@@ -11,7 +11,7 @@ import pytest
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import up_direction
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import circle, look_at_cameras
 from tests.scenes.changing_splats import rig
 

@@ -17,7 +17,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from morgs_mi.io.ply import read_ply, write_ply
 from morgs_mi.io.splats import read_splats
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats, write_stream
 
 PAGE = (Path(__file__).parents[3] / "docs/exports.md").read_text(encoding="utf-8")

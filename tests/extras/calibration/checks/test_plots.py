@@ -15,7 +15,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.checks.plots import draw_rig, write_rig
-from tests.assertions import assert_close
+from morgs_mi.testing import assert_close
 from tests.scenes.cameras import circle, look_at_cameras
 
 

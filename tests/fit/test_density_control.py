@@ -1,0 +1,101 @@
+"""Density control in a loop of one's own."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import morgs_mi
+from morgs_mi import Camera, DensityConfig, DensityControl, Gaussians, rasterize
+from morgs_mi.testing import assert_close
+from tests.scenes.gaussians import isotropic
+
+CAMERA = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 50, 48, 36)
+MEANS = np.array([(-0.8, 0, 0), (0, 0, 0), (0.8, 0, 0)], np.float32)
+
+
+def splats(logits=(1.0, 1.0, 1.0)):
+    gaussians = isotropic(MEANS, 0.1, 0.9, np.zeros((3, 1, 3), np.float32))
+    return Gaussians(**{**gaussians.numpy(), "logit_opacities": np.float32(logits)})
+
+
+def optimizer_of(gaussians, steps=1):
+    """Return Adam after some steps that keep the parameters, with moments of 1, 2, 3, ..."""
+    optimizer = mi.ad.Adam(lr=0.0, params=gaussians.parameters())
+    for name in optimizer:
+        promoted, rate = optimizer.state[name][1:3]
+        moments = [mi.Float(np.arange(1.0, 1 + v.array.shape[0])) for v in [optimizer[name]] * 2]
+        optimizer.state[name] = (optimizer.state[name][0], promoted, rate, (steps, *moments, None))
+    return optimizer
+
+
+def recorded(gaussians):
+    return np.clip(np.array(rasterize(gaussians, CAMERA).color), 0, 1).astype(np.float32)
+
+
+def test_density_control__adds_where_a_view_has_its_error():
+    optimizer = optimizer_of(splats())
+    image = recorded(splats())
+    image[:, 32:] = 1  # behind the third splat
+    control = DensityControl([CAMERA])
+    control.observe(optimizer, CAMERA, image)
+    assert control.scores.argmax() == 2
+    plan = control.step(optimizer, births=1)
+    assert (plan.parent.tolist(), plan.source.tolist()) == ([0, 1, 2, 2], [0, 1, 2, -1])
+    assert {len(np.array(optimizer[name])) for name in optimizer} == {4}
+    assert control.scores is None
+
+
+def test_density_control__carries_moments_and_prunes_faint_gaussians():
+    optimizer = optimizer_of(splats(logits=(1, -9, 1)))
+    control = DensityControl([CAMERA])
+    control.scores = np.array([0, 9, 1.0])
+    plan = control.step(optimizer, births=1)
+    assert plan.parent.tolist() == [0, 2, 2]
+    _, first, second, _ = optimizer.state["logit_opacities"][3]
+    assert_close(first, np.array([1.0, 3, 0]))
+    assert_close(second, np.array([1.0, 3, 0]))
+    assert len(Gaussians.from_parameters(optimizer)) == 3
+
+
+def test_density_control__keeps_the_picture_of_a_clone():
+    optimizer = optimizer_of(splats())
+    control = DensityControl([CAMERA], DensityConfig(split_scale=1.0))
+    control.scores = np.array([0, 0, 1.0])
+    opacity = np.array(rasterize(splats(), CAMERA, ("alpha",)).alpha).sum()
+    control.step(optimizer, births=1)
+    clone_alpha = rasterize(Gaussians.from_parameters(optimizer), CAMERA, ("alpha",)).alpha
+    assert np.array(clone_alpha).sum() == pytest.approx(opacity, rel=0.15)  # the clone is displaced
+
+
+def test_density_control__refuses_scores_of_other_gaussians_and_missing_parameters():
+    control = DensityControl([CAMERA])
+    control.scores = np.zeros(2)
+    with pytest.raises(ValueError, match=r"`scores` must be \[3\]"):
+        control.step(optimizer_of(splats()), births=1)
+    with pytest.raises(ValueError, match="none of the name means"):
+        control.step(mi.ad.Adam(lr=0.0, params={"data": mi.TensorXf([1.0])}), births=1)
+    with pytest.raises(ValueError, match="`cameras` or `extent` must be given"):
+        DensityControl()
+
+
+def test_update_ellipsoids__follows_another_number_of_gaussians_with_gradients():
+    shape = morgs_mi.ellipsoids(splats())
+    integrator = {"type": "gaussian_splat", "srgb_primitives": False}
+    scene = mi.load_dict({"type": "scene", "gaussians": shape, "integrator": integrator})
+    params = mi.traverse(scene)
+    sensor = mi.load_dict(CAMERA.sensor())
+    optimizer = optimizer_of(splats())
+    control = DensityControl([sensor])
+    control.scores = np.array([0, 0, 1.0])
+    control.step(optimizer, births=1)
+    gaussians = Gaussians.from_parameters(optimizer)
+    morgs_mi.update_ellipsoids(params, gaussians)
+    image = mi.render(scene, params, sensor=sensor)
+    assert_close(image, rasterize(gaussians, CAMERA).color, atol=1e-5)
+    dr.backward(dr.sum(image, axis=None))
+    assert np.abs(np.array(dr.grad(optimizer["means"]))).max() > 0
+    with pytest.raises(ValueError, match=r"must have other\.data"):
+        morgs_mi.update_ellipsoids(params, gaussians, "other")

@@ -1,0 +1,106 @@
+"""Backgrounds: a colour of the renderer's settings, and an image of a camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, RenderConfig, StreamLoop, rasterize
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.region import Region
+from morgs_mi.render.view_group import ViewGroup
+from morgs_mi.testing import IMAGE_ABS, assert_close
+from tests.quick import NO_DENSITY, quick
+from tests.scenes.ball import opaque_ball
+from tests.scenes.cameras import QUAD, look_at_cameras
+from tests.scenes.gaussians import make_scene, to_gaussians
+
+W = 48
+H = 33
+CAMERA = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, W, H)
+IMAGE = np.random.default_rng(0).uniform(0, 1, (H, W, 3)).astype(np.float32)
+BEHIND = replace(CAMERA, background=IMAGE)
+COLOR = (0.1, 0.2, 0.3)
+
+
+@pytest.fixture(scope="module")
+def gaussians():
+    return to_gaussians(make_scene(n=30))
+
+
+def over(gaussians, background):
+    """Return the image of CAMERA, composited over a background."""
+    image = rasterize(gaussians, CAMERA)
+    return np.array(image.color) + (1 - np.array(image.alpha)) * np.float32(background)
+
+
+def test_rasterize__composites_over_images_and_colours(gaussians):
+    expected = over(gaussians, IMAGE)
+    assert_close(rasterize(gaussians, BEHIND).color, expected, atol=IMAGE_ABS)
+    assert_close(rasterize(gaussians, CAMERA, background=IMAGE).color, expected, atol=IMAGE_ABS)
+    config = RenderConfig(background=COLOR)
+    colored = over(gaussians, COLOR)
+    assert_close(rasterize(gaussians, CAMERA, config=config).color, colored, atol=IMAGE_ABS)
+    both = rasterize(gaussians, [BEHIND, CAMERA], config=config).color
+    assert_close(both, np.stack([expected, colored]), atol=IMAGE_ABS)
+    black = rasterize(gaussians, BEHIND, background=(0, 0, 0)).color
+    assert_close(black, over(gaussians, (0, 0, 0)), atol=IMAGE_ABS)
+
+
+def test_rasterize__gradient_of_an_image_behind_is_the_transmittance(gaussians):
+    background = mi.TensorXf(IMAGE)
+    dr.enable_grad(background)
+    image = rasterize(gaussians, CAMERA, ("color", "alpha"), background=background)
+    dr.backward(dr.sum(image.color, axis=None))
+    expected = np.repeat(1 - np.array(dr.detach(image.alpha)), 3, axis=2)
+    assert_close(dr.grad(background), expected, atol=IMAGE_ABS)
+
+
+def test_active_views__draw_the_image_behind_their_region(gaussians):
+    mask = np.zeros((H, W), bool)
+    mask[5:20, 7:30] = True
+    region = Region.of(mask)
+    view = ActiveView(BEHIND, region=region)
+    expected = over(gaussians, IMAGE)
+    assert_close(view.render(gaussians).color, region.crop(expected), atol=IMAGE_ABS)
+    other = ActiveView(replace(CAMERA, background=1 - IMAGE))
+    group = ViewGroup([view, other])
+    color = np.asarray(group.draw(gaussians).color).reshape(group.region.shape(3))
+    images = [expected, over(gaussians, 1 - IMAGE)]
+    assert_close(color, group.crop(images), atol=IMAGE_ABS)
+
+
+def test_camera__resizes_and_refuses_backgrounds():
+    bytes_behind = replace(CAMERA, background=np.full((H, W, 3), 255, np.uint8))
+    assert_close(bytes_behind.resized(24, 16).background, np.ones((16, 24, 3)))
+    with pytest.raises(ValueError, match=r"`background` must be .* \[33, 48, 3\], got float64 \[4"):
+        replace(CAMERA, background=np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match="`background` must be finite"):
+        replace(CAMERA, background=np.full((H, W, 3), np.nan))
+
+
+def test_stream_loop__fits_what_stands_before_the_background():
+    """A ball before white: without a background, Gaussians for the white hide it in other views."""
+    ball = opaque_ball()
+    means = ball.numpy()["means"]
+    white = RenderConfig(background=(1.0, 1.0, 1.0))
+    cameras = look_at_cameras(QUAD, 90)
+    other = Camera.look_at((2.5, -1, -3), (0, 0, 0), (0, -1, 0), 90, 64, 48)
+    *images, truth = (
+        np.clip(np.array(rasterize(ball, camera, config=white).color), 0, 1)
+        for camera in (*cameras, other)
+    )
+    scores = []
+    for settings in (RenderConfig(), white):
+        config = quick(num_gaussians=400, first_frame_steps=100, density=NO_DENSITY)
+        config = replace(config, render=settings)
+        loop = StreamLoop(cameras, means, np.full((len(means), 3), 0.5), config)
+        loop.push([np.uint8(255 * image + 0.5) for image in images])
+        image = np.array(rasterize(loop.gaussians, other, config=settings).color)
+        scores.append(psnr(np.clip(image, 0, 1), truth))
+    assert scores[1] > scores[0] + 6
