@@ -204,9 +204,11 @@ def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> 
     is none.
     """
     # OpenCV leaves out the columns with partners that may lie outside the image.
-    pad = count + abs(lowest) + _BLOCK
+    left_pad = max(lowest + count, 0) + _BLOCK
+    right_pad = max(-lowest, 0) + _BLOCK
     wide = [
-        cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_CONSTANT) for image in (left, right)
+        cv2.copyMakeBorder(image, 0, 0, left_pad, right_pad, cv2.BORDER_CONSTANT)
+        for image in (left, right)
     ]
     area = 3 * _BLOCK**2
     matcher = cv2.StereoSGBM.create(
@@ -220,7 +222,7 @@ def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> 
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    return matcher.compute(*wide)[:, pad:-pad] / 16.0
+    return matcher.compute(*wide)[:, left_pad:-right_pad] / 16.0
 
 
 def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:

@@ -361,7 +361,7 @@ def _check_complete(reader: FrameReader, required: int) -> None:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the "
             "file is truncated or broken; copy it again, use the frames before it (`max_frames`), "
-            "or leave its camera out, of the later frames (--gaps) or of all (--without)."
+            "or leave its camera out, of the later frames (--gaps) or of all (--exclude)."
         )
 
 
@@ -401,7 +401,7 @@ def _num_frames(
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "
             f"with `max_frames={shortest}`, those that all clips cover with --trim, align the "
-            "clips with --offset, or leave cameras out with --without."
+            "clips with --offset, or leave cameras out with --exclude."
         )
     return shortest
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,17 +9,21 @@ from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import optional, place
+from morgs_mi.cli.settings import (
+    optional,
+    options,
+    place,
+)
 from morgs_mi.cli.streams import DropInvalid, opened
 
 
-@dataclass(frozen=True)
+@options
 class Accuracy:
     """Compare the renderer with a float64 reference, for a file of Gaussians or the first frame of
     a stream: error against run time along its settings.
     """
 
-    out: Positional[Path]
+    source: Positional[Path]
     """File of Gaussians, .ply, .compressed.ply or .splat, folder of a fit, or a stream file."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.png")] = None
     """Plot, beside which a .json has all results; by default OUT/NAME-accuracy.png. Needs the extra
@@ -42,7 +45,7 @@ class Accuracy:
         from morgs_mi.evaluate.accuracy import accuracy
         from morgs_mi.playback.stream_header import find_camera
 
-        stream = opened(self.out, self.drop_invalid)
+        stream = opened(self.source, self.drop_invalid)
         view = find_camera(stream, self.camera or 0)
         beside = stream.path.with_name(f"{stream.path.stem}-accuracy.png")
         plot = check_output(self.output or beside)

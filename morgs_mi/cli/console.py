@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import logging
 import re
+import shlex
+import shutil
+import sys
+import textwrap
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from datetime import timedelta
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
+    Task,
     TaskID,
     TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 from rich.table import Table
 from rich.text import Text
 
-from morgs_mi.core.progress import Report
+from morgs_mi.core.progress import Report, duration
 
 
 def printable(text: str) -> str:
@@ -45,6 +49,7 @@ class _Console(Console):
         # Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:`
         # into an emoji.
         super().__init__(markup=False, highlight=False, emoji=False, **options)
+        self.soft_wrap = not self.is_terminal
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Return a text as Rich prints it."""
@@ -53,8 +58,8 @@ class _Console(Console):
 
 STDOUT = "standard output"
 """Name of standard output in errors."""
-OUT = _Console(soft_wrap=True)
-ERR = _Console(stderr=True, soft_wrap=True)
+OUT = _Console()
+ERR = _Console(stderr=True)
 
 # Errors that the user can correct; any other is a fault of the package, or of a library.
 _EXPECTED = (ValueError, OSError, MemoryError, ArithmeticError)
@@ -76,21 +81,38 @@ def quantity(count: int, noun: str) -> str:
 
 
 def print_result(text: str) -> None:
-    """Print to standard output.
+    """Print to standard output; on a terminal, lines are wrapped between words.
 
     Raises:
         OSError: it is full or closed; the error names it.
     """
+    lines = printable(text).split("\n")
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        wrapped = [
+            textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False) or [""]
+            for line in lines
+        ]
+        lines = [line for part in wrapped for line in part]
     with naming_output():
-        print(printable(text))
+        print("\n".join(lines))
 
 
-def print_table(table: Table) -> None:
-    """Print to standard output with complete columns, even where the terminal is narrower than the
-    table.
-    """
+def print_next(*words: object) -> None:
+    """Print the command that is likely to follow."""
+    print_result(f"Next: morgs-mi {shlex.join(map(str, words))}")
+
+
+def print_table(table: Table, dispensable: Sequence[str] = ()) -> None:
+    """Print to standard output, on a narrow terminal without the first of some columns."""
+    wide = _Console(width=10_000)
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        for header in dispensable:
+            if Measurement.get(wide, wide.options, table).maximum > width:
+                table.columns = [column for column in table.columns if column.header != header]
     with naming_output():
-        _Console(width=10_000).print(table)
+        (_Console() if sys.stdout.isatty() else wide).print(table)
 
 
 def print_warning(text: str) -> None:
@@ -171,20 +193,31 @@ def progress() -> Iterator[Report]:
         return
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=20),
         MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        _Time(),
     )
     tasks: dict[str, TaskID] = {}
     with Progress(*columns, console=ERR) as bars:
 
         def report(stage: str, done: float, total: float) -> None:
             if stage not in tasks:  # what was done before is not part of its pace
-                tasks[stage] = bars.add_task(stage, completed=int(done))
+                tasks[stage] = bars.add_task(stage, total=total, completed=int(done))
             bars.update(tasks[stage], completed=done, total=total)
 
         yield report
+        for task in tasks.values():  # a stage may end before its last step
+            bars.update(task, completed=bars.tasks[task].total)
+
+
+class _Time(ProgressColumn):
+    """The time that a stage still takes, or has taken."""
+
+    def render(self, task: Task) -> Text:
+        """Return the time in words."""
+        left = None if task.finished else task.time_remaining
+        seconds = task.finished_time if task.finished else task.elapsed
+        return Text(duration(seconds or 0) if left is None else f"about {duration(left)} left")
 
 
 def _line_report() -> Report:
@@ -200,10 +233,9 @@ def _line_report() -> Report:
             return
         last = moment
         seconds = moment - start
-        line = f"{stage}: {int(done)}/{total:.0f}, {timedelta(seconds=round(seconds))} elapsed"
+        line = f"{stage}: {int(done)}/{total:.0f}, {duration(seconds)} elapsed"
         if done > base:  # at the pace of the steps that are done
-            left = timedelta(seconds=round(seconds * (total - done) / (done - base)))
-            line += f", about {left} left"
+            line += f", about {duration(seconds * (total - done) / (done - base))} left"
         print_warning(f"{line}.")
 
     return report

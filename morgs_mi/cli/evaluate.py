@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,17 +10,21 @@ from typing import Annotated
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.cli.console import print_result, print_table, print_warning, progress
-from morgs_mi.cli.settings import Flag, optional
+from morgs_mi.cli.console import print_next, print_result, print_table, print_warning, progress
+from morgs_mi.cli.settings import (
+    Flag,
+    optional,
+    options,
+)
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
 from morgs_mi.runs.fit_files import FILES
 
 
-@dataclass(frozen=True)
+@options
 class Eval:
     """Measure a stream against its capture: quality, motion, bytes and seconds."""
 
-    out: Positional[Path]
+    source: Positional[Path]
     """Folder of a fit, or a stream file."""
     capture: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
     """Capture that was fitted, if it has moved since the fit."""
@@ -41,8 +44,10 @@ class Eval:
         from morgs_mi.evaluate.evaluate import evaluate_stream
         from morgs_mi.playback.streams import spans
 
-        folder = self.out if self.out.is_dir() else self.out.parent
-        files_of_fit = [path.resolve() for path in (self.out, *(folder / name for name in FILES))]
+        folder = self.source if self.source.is_dir() else self.source.parent
+        files_of_fit = [
+            path.resolve() for path in (self.source, *(folder / name for name in FILES))
+        ]
         output = None if self.json == Path("-") else self.json
         if output is not None and check_output(output).resolve() in files_of_fit:
             raise ValueError(
@@ -54,7 +59,7 @@ class Eval:
             network = extra("image distances", "lpips")(self.lpips)
         with progress() as report:
             frames = partial(report, "Evaluating frames")
-            result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
+            result = evaluate_stream(self.source, self.capture, frames, network, self.any_recording)
         scores = {**result.as_dict(), "machine": machine(), "versions": versions()}
         if self.json == Path("-"):
             print_result(json.dumps(json_finite(scores), indent=2))
@@ -76,3 +81,4 @@ class Eval:
         if output is not None:
             write_json(output, scores)
             print_result(f"All results: {output}")
+        print_next("view", self.source)

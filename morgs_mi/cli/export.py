@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import quantity
-from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_command, optional, place
+from morgs_mi.cli.settings import (
+    ChannelName,
+    DisplayExposure,
+    Flag,
+    one_command,
+    optional,
+    options,
+    place,
+)
 from morgs_mi.cli.streams import (
     FRAMES,
     DropInvalid,
@@ -20,7 +27,6 @@ from morgs_mi.cli.streams import (
     relative_to,
     shown_exposure,
 )
-from morgs_mi.core.documentation import page
 from morgs_mi.core.extras import extra, places
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
@@ -28,13 +34,8 @@ from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
-_PATH = (
-    "Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file "
-    f"({page('exports')})."
-)
 
-
-@dataclass(frozen=True)
+@options
 class Ply(ExportKind):
     """Write a PLY file per frame, in the layout of 3D Gaussian Splatting or compressed, in the
     capture's axes.
@@ -56,13 +57,16 @@ class Ply(ExportKind):
         return quantity(len(frames), "PLY file") + relative_to(stream)
 
 
-@dataclass(frozen=True)
+@options
 class Flight(ExportKind):
     """Render a stream along a moving camera into an mp4."""
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.mp4")] = None
     """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
-    path: Annotated[str, arg(help=_PATH)] = "between"
+    path: Annotated[str, arg(metavar="PATH")] = "between"
+    """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file
+    (docs/exports.md).
+    """
     seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
     """Duration in seconds; by default the duration in the JSON file, or of the clip, which is
     repeated up to LEAST_SECONDS.
@@ -115,7 +119,7 @@ class Flight(ExportKind):
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
 
 
-@dataclass(frozen=True)
+@options
 class Web(ExportKind):
     """Write a web page that plays the stream without a server, or a folder for a server."""
 
@@ -147,7 +151,7 @@ EXPORTS: Mapping[str, type[ExportKind]] = {
 }
 
 
-@dataclass(frozen=True)
+@options
 class Export:
     """Export a stream for other programs."""
 
@@ -156,4 +160,4 @@ class Export:
     drop_invalid: DropInvalid = False
 
     def run(self) -> None:
-        self.kind.run(opened(self.kind.out, self.drop_invalid, self.kind.drawn))
+        self.kind.run(opened(self.kind.source, self.drop_invalid, self.kind.drawn))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.console import print_next, print_result, progress
 from morgs_mi.cli.settings import (
     Flag,
     GivenReading,
@@ -21,23 +21,22 @@ from morgs_mi.cli.settings import (
     Settings,
     held_out,
     optional,
+    options,
 )
 from morgs_mi.core.config import Count, check_value, config_toml
-from morgs_mi.core.documentation import page
 from morgs_mi.core.fit_names import STREAM
 
 if TYPE_CHECKING:
     from morgs_mi.loop.frame_report import FrameReport
 
-_SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786 ({page('cluster')})."
 
-
-@dataclass(frozen=True)
+@options
 class Fit:
     """Reconstruct a capture, frame after frame, into OUT/stream.morgs.
 
-    All other settings are in a file, see --print-config and --config. The file overrides the
-    preset; options override both.
+    All other settings are in a file, see --print-config and --config.
+
+    The file overrides the preset; options override both.
     """
 
     capture: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
@@ -50,24 +49,41 @@ class Fit:
     """Number of frames to fit, from the first one."""
     downscale: float = 1
     """Factor by which the images are reduced; 2 halves width and height."""
-    test_view: HeldOut = ("auto",)
+    reading: GivenReading = field(default_factory=Reading)
+    hold_out: HeldOut = ("auto",)
     """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0
     of six or more.
     """
-    reading: GivenReading = field(default_factory=Reading)
     settings: GivenSettings = field(default_factory=Settings)
+    print_config: Flag = False
+    """Print all settings as TOML and exit."""
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
     chunks: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
     """Number of parts of the recording that are fitted side by side, by the extra cluster; each
     begins with a keyframe."""
-    scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS", text=_SCHEDULER)] = None
-    print_config: Flag = False
-    """Print all settings as TOML and exit."""
+    scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS")] = None
+    """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/cluster.md)."""
     reproducible: Flag = False
     """Sum in a fixed order: on a CPU every fit does; a GPU cannot."""
 
-    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
+    groups: ClassVar[Mapping[str, Sequence[str]]] = {
+        "input": ("frames", "downscale", "trim", "offset", "gaps", "exclude", "near"),
+        "cameras": ("hold-out", "exposure", "refine-cameras"),
+        "first frame": (
+            "num-gaussians",
+            "first-frame-steps",
+            "first-frame-seconds",
+            "sh-degree",
+        ),
+        "later frames": ("epochs", "flow", "masks"),
+        "output": ("quality", "target-size", "resume"),
+    }
+    arguments: ClassVar[Mapping[str, str]] = {
+        "max_frames": "--frames",
+        "test_view": "--hold-out",
+        "without": "--exclude",
+    }
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
@@ -79,12 +95,12 @@ class Fit:
         if self.capture is None or self.out is None:
             raise ValueError(
                 "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before "
-                "options with several values, such as --test-view, and see morgs-mi fit --help."
+                "options with several values, such as --hold-out, and see morgs-mi fit --help."
             )
         if self.chunks is not None:
             check_value("fit()", "chunks", self.chunks, Count)
         self.settings.check_methods(config)
-        views = held_out(self.test_view)
+        views = held_out(self.hold_out)
         reading = self.reading.read_config()
         capture = load_capture(self.capture, self.downscale, views, self.frames, reading)
         if self.chunks is not None or self.scheduler is not None:
@@ -109,6 +125,7 @@ class Fit:
             with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
                 reports = stream_capture(capture, self.out, config, self.resume, report)
         _print_summary(self.out / STREAM, reports)
+        print_next("view", self.out)
 
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:

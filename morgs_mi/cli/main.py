@@ -11,13 +11,17 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shlex
+import shutil
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout, suppress
+from dataclasses import fields, is_dataclass
+from functools import partial
 from importlib.metadata import version
-from io import TextIOWrapper
+from io import StringIO, TextIOWrapper
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -37,7 +41,13 @@ from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
 from morgs_mi.cli.fit import Fit
 from morgs_mi.cli.render import Render
-from morgs_mi.cli.settings import Flag, Settings, one_command
+from morgs_mi.cli.settings import (
+    Flag,
+    Settings,
+    fill_help,
+    one_command,
+    options,
+)
 from morgs_mi.cli.view import View
 from morgs_mi.core.extras import extra, places
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
@@ -56,7 +66,7 @@ COMMANDS: Mapping[str, type] = {
 }
 
 
-@dataclass(frozen=True)
+@options
 class Common:
     """Options of every command."""
 
@@ -70,7 +80,7 @@ class Common:
     """Print tracebacks and debug messages."""
 
 
-@dataclass(frozen=True)
+@options
 class Options(Common):
     """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving
     Gaussians.
@@ -99,17 +109,18 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             print_result(f"{prog} {version('morgs-mi')}")
             _flush_output()
             return 0
-        with naming_output():  # the help goes there
-            options: Any = tyro.cli(
-                options_type,
-                prog=prog,
-                args=args,
-                config=(
-                    tyro.conf.CascadeSubcommandArgs,
-                    tyro.conf.OmitSubcommandPrefixes,
-                    tyro.conf.PositionalMetavarFromFieldName,
-                ),
-            )
+        parse = partial(
+            tyro.cli,
+            options_type,
+            prog=prog,
+            args=args,
+            config=(
+                tyro.conf.CascadeSubcommandArgs,
+                tyro.conf.OmitSubcommandPrefixes,
+                tyro.conf.PositionalMetavarFromFieldName,
+            ),
+        )
+        options: Any = _help(parse, args) if {"-h", "--help"} & {*args} else parse()
         command = options.command
         _set_up(options)
         with interruptible():
@@ -135,6 +146,32 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             ERR.print_exception()
         _drop_output()
         return INTERRUPTED if is_interruption(error) else 1
+
+
+def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:
+    """Print the help of a command in lines that fit the terminal."""
+    fill_help()
+    text = StringIO()
+    try:
+        with redirect_stdout(text):
+            return parse()
+    finally:
+        width = shutil.get_terminal_size().columns
+        command = next((COMMANDS[word] for word in args if word in COMMANDS), None)
+        groups: Mapping[str, Sequence[str]] = getattr(command, "groups", {})
+        titles = {option: title for title, options in groups.items() for option in options}
+        blocks = {title: [f" {title}", f" {'-' * (width - 2)}"] for title in groups}
+        blocks = {"": [], **blocks}
+        title = ""
+        # No value is no default.
+        content = re.sub(r"\s+\(default:\s*(None)?\)", "", text.getvalue())
+        for line in map(str.rstrip, content.splitlines()):
+            if not line.startswith("   "):
+                title = titles.get(line.removeprefix("  --").partition(" ")[0], "")
+            # The names of all commands are one word.
+            line = line.replace(",", ", ") if line.startswith("usage:") else line
+            blocks[title] += textwrap.wrap(line, width) if len(line) > width else [line]
+        print_result("\n\n".join("\n".join(block).rstrip() for block in blocks.values()))
 
 
 def _flush_output() -> None:

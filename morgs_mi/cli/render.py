@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress, quantity
-from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, options
 from morgs_mi.cli.streams import DropInvalid, opened, shown_exposure
-from morgs_mi.core.documentation import page
 from morgs_mi.core.extras import extra
 from morgs_mi.playback.export.formats import IMAGES, destination
 
@@ -23,58 +21,50 @@ if TYPE_CHECKING:
 # Index and channels of each image.
 _Images = Iterator[tuple[int, dict[str, Any]]]
 
-_CHANNELS = (
-    "Channels to render, side by side: color, motion, confidence, depth, alpha. By default color, "
-    "and for EXR files all that the stream stores."
-)
-_OUTPUT = (
-    "FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for "
-    "multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels, "
-    "confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, with "
-    "the name of the camera or the path."
-)
-_CAMERA = (
-    "Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A "
-    "file of Gaussians has front, front-right, right, back-right, back, back-left, left and "
-    "front-left, or the cameras of its training. By default, a single image is seen by the first "
-    "camera; for a file, by the one with most detail in view."
-)
-_PATH = (
-    "Camera path, instead of a camera: orbit (around the scene, the default), between (through "
-    f"the cameras), or a JSON file ({page('exports')}). `morgs-mi export video` has more options."
-)
-_INSERT = (
-    "Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function "
-    "build(frame, time) that returns the entries of a scene. Without emitters it is lit by the "
-    "stream."
-)
 
-
-@dataclass(frozen=True)
+@options
 class Render:
     """Render a stream or a file of Gaussians into a video, EXR files or PNG files, for one camera
     or along a path.
     """
 
-    out: Positional[Path]
+    source: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     output: Annotated[
         Positional[Path | None],
         DisallowNone,
-        arg(metavar="[FILE_OR_FOLDER]", help=_OUTPUT, help_behavior_hint=""),
+        arg(metavar="[FILE_OR_FOLDER]", help_behavior_hint=""),
     ] = None
-    camera: Annotated[str | None, DisallowNone, optional("CAMERA", text=_CAMERA)] = None
-    path: Annotated[str | None, DisallowNone, optional("PATH", text=_PATH)] = None
+    """FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for
+    multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels,
+    confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, with
+    the name of the camera or the path.
+    """
+    camera: Annotated[str | None, DisallowNone, optional("CAMERA")] = None
+    """Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A
+    file of Gaussians has front, front-right, right, back-right, back, back-left, left and
+    front-left, or the cameras of its training. By default, a single image is seen by the first
+    camera; for a file, by the one with most detail in view.
+    """
+    path: Annotated[str | None, DisallowNone, optional("PATH")] = None
+    """Camera path, instead of a camera: orbit (around the scene, the default), between (through
+    the cameras), or a JSON file (docs/exports.md). `morgs-mi export video` has more options.
+    """
     degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
     """Angle of an orbit, 1 to 360; by default the extent of the rig, and 60 for a file of
     Gaussians.
     """
     width: Annotated[int | None, DisallowNone, optional("INT")] = None
     """Width of the images; by default that of the camera."""
-    channels: Annotated[
-        tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)
-    ] = None
-    insert: Annotated[Path | None, DisallowNone, optional("FILE", text=_INSERT)] = None
+    channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...")] = None
+    """Channels to render, side by side: color, motion, confidence, depth, alpha. By default color,
+    and for EXR files all that the stream stores.
+    """
+    insert: Annotated[Path | None, DisallowNone, optional("FILE")] = None
+    """Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function
+    build(frame, time) that returns the entries of a scene. Without emitters it is lit by the
+    stream.
+    """
     at: Annotated[tuple[int, ...] | None, DisallowNone, optional("FRAME ...", "(default: all)")] = (
         None
     )
@@ -109,7 +99,7 @@ class Render:
             )
         if self.insert is not None and self.camera is None:
             raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
-        stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
+        stream = opened(self.source, self.drop_invalid, skip_damaged=self.skip_damaged)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
         is_path = self.camera is None and self.insert is None
         stem = Path(self.path or "orbit").stem if is_path else view.name

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
 
 from tyro.conf import DisallowNone, FlagCreatePairsOff, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
@@ -16,7 +16,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.config import apply_values, read_config, relocated
-from morgs_mi.core.documentation import page
+from morgs_mi.core.documentation import field_docs, with_pages
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
 
 # The setting of every option. All others are set in a file.
@@ -35,12 +35,9 @@ SETTINGS = {
     "exposure": "fit.exposure",
 }
 
-_PRESET = (
-    "Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, "
-    f"ml-mo, ml-mo-mc (its ablation), or rigidity (rigid neighbours, {page('experiments/field')})."
-)
-_FLOW = f"Optical flow: a method, files:FOLDER or onnx:FILE ({page('flow')})."
-_MASKS = f"Refinement of the motion masks ({page('masks')})."
+Options = TypeVar("Options")
+# Classes whose help is that of their fields' docstrings.
+_OPTIONS: list[Any] = []
 # A channel that commands render.
 ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
 # Whether something is estimated.
@@ -61,23 +58,44 @@ def held_out(names: Sequence[str]) -> TestViews:
     return keywords.get(tuple(names), tuple(names))
 
 
-def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
+@dataclass_transform(frozen_default=True)
+def options(command: type[Options]) -> type[Options]:
+    """Return a frozen dataclass of options, whose help is made of their docstrings."""
+    _OPTIONS.append(dataclass(frozen=True)(command))
+    return command
+
+
+def fill_help() -> None:
+    """Set the help of all options, and of the configs among them, to their docstrings, each one
+    paragraph; tyro would keep the line breaks of the source.
+    """
+    for command in _OPTIONS:
+        for kind in get_type_hints(command).values():
+            if is_dataclass(kind) and kind not in _OPTIONS:
+                _OPTIONS.append(kind)
+        for name, text in field_docs(command).items():
+            help_text = with_pages(" ".join(text.split()))
+            annotation = Annotated[command.__annotations__[name], arg(help=help_text)]
+            command.__annotations__[name] = annotation
+
+
+def optional(metavar: str, hint: str = "") -> Any:
     """Return the help of an option that is None where it is not given, without the word None.
 
     Args:
         metavar: name of the value.
         hint: text after the help.
-        text: the help, if it is longer than the one line that tyro reads from a field's docstring
-            unbroken.
     """
-    return arg(metavar=metavar, help_behavior_hint=hint, help=text)
+    return arg(metavar=metavar, help_behavior_hint=hint)
 
 
-_EXPOSURE = (
+_STOPS = (
     "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a "
     "recording of 8 bits."
 )
-DisplayExposure = Annotated[float | None, DisallowNone, optional("STOPS", text=_EXPOSURE)]
+DisplayExposure = Annotated[
+    float | None, DisallowNone, arg(metavar="STOPS", help_behavior_hint="", help=_STOPS)
+]
 """Option of the commands that render a stream."""
 
 
@@ -86,19 +104,13 @@ def place(metavar: str) -> Any:
     return arg(metavar=f"[{metavar}]", help_behavior_hint="")
 
 
-def setting(option: str, config: StreamConfig | None = None, text: str | None = None) -> Any:
-    """Return the help of an option that is None where it is not given: the type of its setting, and
-    the default.
-
-    The text of the help is the field's docstring, or `text` with the places of the pages that it
-    cites.
+def setting(option: str, config: StreamConfig | None = None, metavar: str = "") -> Any:
+    """Return the help of an option that is None where it is not given: the name of its value, by
+    default its type, and the default.
     """
     default = reduce(getattr, SETTINGS[option].split("."), config or StreamConfig())
-    return arg(
-        metavar=type(default).__name__.upper(),
-        help_behavior_hint=f"(default: {default})",
-        help=text,
-    )
+    metavar = metavar or type(default).__name__.upper()
+    return arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
 def one_command(commands: Mapping[str, type]) -> Any:
@@ -150,7 +162,7 @@ def one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
     )
 
 
-@dataclass(frozen=True)
+@options
 class Reading:
     """Options for differences between the clips of a capture: the fields of `ReadConfig`."""
 
@@ -164,29 +176,31 @@ class Reading:
     """
     gaps: Flag = False
     """Continue where images are missing, without their cameras."""
-    without: Without = ()
+    exclude: Without = ()
     """Cameras that are left out, by name."""
-    near: Annotated[
-        float | None, optional("UNITS", f"(default: from the scene, {page('captures')})")
-    ] = None
-    """Depth of the cameras' near planes."""
+    near: Annotated[float | None, optional("UNITS", "(default: from the scene)")] = None
+    """Depth of the cameras' near planes (docs/captures.md)."""
 
     def read_config(self) -> ReadConfig:
         """Return the options as `load_capture` takes them."""
-        return ReadConfig(**asdict(self))
+        values = asdict(self)
+        return ReadConfig(without=values.pop("exclude"), **values)
 
 
-@dataclass(frozen=True)
+@options
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    preset: Annotated[
-        PresetName | None, optional("NAME", text=_PRESET), one_of(get_args(PresetName))
+    refine_cameras: Annotated[
+        Estimation | None, setting("refine_cameras", metavar="MODE"), one_of(get_args(Estimation))
     ] = None
-    config: Annotated[Path | None, optional("FILE.toml")] = None
-    """File with any settings, as --print-config writes it."""
-    seed: Annotated[int | None, setting("seed")] = None
-    """Seed of every random choice."""
+    """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
+    exposure: Annotated[
+        Estimation | None, setting("exposure", metavar="MODE"), one_of(get_args(Estimation))
+    ] = None
+    """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld
+    pixels gain).
+    """
     num_gaussians: Annotated[int | None, optional("INT", "(default: by detail and time)")] = None
     """Gaussians of the first frame."""
     first_frame_steps: Annotated[
@@ -195,24 +209,26 @@ class Settings:
     """Optimisation steps of the first frame."""
     first_frame_seconds: Annotated[float | None, setting("first_frame_seconds")] = None
     """Time of the first frame, which limits its Gaussians and steps."""
-    epochs: Annotated[int | None, setting("epochs")] = None
-    """Passes over the views for every later frame."""
     sh_degree: Annotated[int | None, setting("sh_degree")] = None
     """Degree of the spherical harmonics, 0 to 3."""
-    flow: Annotated[str | None, setting("flow", text=_FLOW)] = None
-    masks: Annotated[str | None, setting("masks", text=_MASKS)] = None
+    epochs: Annotated[int | None, setting("epochs")] = None
+    """Passes over the views for every later frame."""
+    flow: Annotated[str | None, setting("flow", metavar="METHOD")] = None
+    """Optical flow: a method, files:FOLDER or onnx:FILE (docs/flow.md)."""
+    masks: Annotated[str | None, setting("masks", metavar="METHOD")] = None
+    """Refinement of the motion masks (docs/masks.md)."""
     quality: Annotated[float | None, setting("quality")] = None
     """Precision of the stream; 2 halves all errors."""
     target_size: Annotated[int | None, setting("target_size")] = None
     """Most bytes of a later frame; 0: no limit."""
-    refine_cameras: Annotated[
-        Estimation | None, setting("refine_cameras"), one_of(get_args(Estimation))
-    ] = None
-    """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
-    exposure: Annotated[Estimation | None, setting("exposure"), one_of(get_args(Estimation))] = None
-    """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld
-    pixels gain).
+    preset: Annotated[PresetName | None, optional("NAME"), one_of(get_args(PresetName))] = None
+    """Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, ml-mo,
+    ml-mo-mc (its ablation), or rigidity (rigid neighbours, docs/experiments/field.md).
     """
+    config: Annotated[Path | None, optional("FILE.toml")] = None
+    """File with any settings, as --print-config writes it."""
+    seed: Annotated[int | None, setting("seed")] = None
+    """Seed of every random choice."""
 
     def given(self) -> dict[str, Any]:
         """Return the settings that were given as options, by key."""

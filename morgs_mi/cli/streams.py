@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
-from morgs_mi.cli.settings import optional
+from morgs_mi.cli.settings import options
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import Format, destination
 
@@ -23,9 +22,8 @@ _DROP = (
 )
 DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_hint="")]
 """Option of the commands that read files of Gaussians."""
-FRAMES = optional(
-    "FRAMES", text="Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."
-)
+_SPAN = "Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."
+FRAMES = arg(metavar="FRAMES", help_behavior_hint="", help=_SPAN)
 
 
 def opened(
@@ -69,11 +67,11 @@ def relative_to(stream: FrameSource) -> str:
     return f", relative to the origin ({x:.10g}, {y:.10g}, {z:.10g})" if x or y or z else ""
 
 
-@dataclass(frozen=True)
+@options
 class ExportKind:
     """A kind of export: options, with `formats` and the method `write` of their writer."""
 
-    out: Positional[Path]
+    source: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians."""
 
     formats: ClassVar[tuple[Format, ...]]

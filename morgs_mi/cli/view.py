@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import webbrowser
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result
+from morgs_mi.cli.settings import optional, options
 from morgs_mi.cli.streams import DropInvalid, opened
 
 
-@dataclass(frozen=True)
+@options
 class View:
     """View a stream or a file of Gaussians in the browser; a stream even during its fit."""
 
-    out: Positional[Path]
+    source: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
-    host: str = "127.0.0.1"
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address of the server; the default serves this machine only, 0.0.0.0 all machines that have
     the link.
     """
@@ -28,14 +29,14 @@ class View:
     """Open the page in the browser of this machine."""
     follow: bool = False
     """Begin at the newest frame."""
-    capture: Path | None = None
+    capture: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
     """Folder of the capture with the recorded images; by default the one that was fitted."""
     drop_invalid: DropInvalid = False
 
     def run(self) -> None:
         from morgs_mi.playback.viewer.server import Viewer
 
-        viewer = Viewer(opened(self.out, self.drop_invalid), self.host, self.port, self.capture)
+        viewer = Viewer(opened(self.source, self.drop_invalid), self.host, self.port, self.capture)
         print_result(f"{viewer.url} (Ctrl-C to stop)")
         if viewer.is_public:
             print_result(

@@ -130,10 +130,11 @@ def _expected(value: Any, kind: Any) -> str:
         fits = not all(arms.values())
         return "" if fits else " or ".join(arms[arm] for arm in args if arm is not NoneType)
     if origin is Annotated:
-        bounds = [(*_BOUNDS[type(bound)], *astuple(bound)) for bound in args[1:]]
+        limits = [limit for limit in args[1:] if type(limit) in _BOUNDS]
+        bounds = [(*_BOUNDS[type(limit)], *astuple(limit)) for limit in limits]
         words = " and ".join(f"{words} {limit}" for words, _, limit in bounds)
         if expected := _expected(value, args[0]):
-            return f"{expected}, {words}"
+            return f"{expected}, {words}" if words else expected
         return "" if all(holds(value, limit) for _, holds, limit in bounds) else words
     if origin is tuple:  # (kind, ...) or one kind several times
         length = "" if args[1] is ... else f" of {len(args)} items"

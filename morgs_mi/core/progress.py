@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import timedelta
 from typing import Any
 
 Report = Callable[[str, float, float], None]
@@ -19,6 +18,14 @@ Steps = Callable[[int, int], None]
 
 _PERIOD = 0.2  # seconds between two updates
 _WIDTH = 30
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words, such as ``30 s`` or ``4 min``."""
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= 1.5 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 @dataclass(frozen=True)
@@ -76,11 +83,11 @@ class ProgressBar:
         self._shown = moment
         share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
         seconds = moment - self._begin
-        text = f"{share}, {timedelta(seconds=round(seconds))}"
+        text = f"{share}, {duration(seconds)}"
         self._first = min(done, self._first)  # what was done before is not part of the pace
         if total and self._first < done < total:
             seconds_left = seconds * (total - done) / (done - self._first)
-            text += f", about {timedelta(seconds=round(seconds_left))} left"
+            text = f"{share}, about {duration(seconds_left)} left"
         name = f"{self._title}: {self._stage}" if self._stage else self._title
         if is_notebook():
             from IPython.display import HTML, display  # type: ignore[import-not-found]

@@ -48,7 +48,7 @@ def image_status(
         color = "black" if max(thumbnails[v].mean() for v in plain) < _BLACK else "of one colour"
         sentences.append(
             f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or "
-            "leave the camera out (--without)"
+            "leave the camera out (--exclude)"
         )
     if cuts and 2 * len(cuts) >= len(thumbnails):
         sentences.append(
@@ -58,7 +58,7 @@ def image_status(
     elif cuts:
         sentences.append(
             f"{_list(names, cuts)}: the image shows something else than in the frame before; if "
-            "the camera was moved, or its clip has a cut, leave it out (--without)"
+            "the camera was moved, or its clip has a cut, leave it out (--exclude)"
         )
     return tuple(sentences)
 

@@ -82,15 +82,20 @@ class SplatFile(FrameSource):
 
 
 def stream_path(out: str | Path) -> Path:
-    """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, of its
-    ``stream.morgs``.
+    """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, or
+    with one fit in it, of its ``stream.morgs``.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: there is a file of another format, or a folder with files of Gaussians instead.
     """
     path = Path(out)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder; check the path.")
     if path.is_dir() and not (path / STREAM).exists():
+        fits = [path / file.name for file in listed(path) if (file / STREAM).is_file()]
+        if path / "stream" in fits or len(fits) == 1:  # of the demo, and of nobody else
+            return stream_path(path / "stream" if path / "stream" in fits else fits[0])
         if (path / "meta.json").is_file():
             refuse_foreign(path / "meta.json")
         if frames := [file.name for file in listed(path) if suffix_of(file)]:
@@ -100,9 +105,7 @@ def stream_path(out: str | Path) -> Path:
             )
     path = path / STREAM if path.is_dir() else path
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: expected a stream, found none; check the path or fit a capture first."
-        )
+        raise FileNotFoundError(f"{path}: expected a stream, found none; fit a capture first.")
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
     if start != MAGIC:

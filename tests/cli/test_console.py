@@ -32,10 +32,10 @@ def test_progress__prints_a_line_every_30_seconds_without_a_terminal(capsys, mon
             clock += 10.0
         report("Drawing", 0, 2)
     assert capsys.readouterr().err.splitlines() == [
-        "Fitting frames: 3/12, 0:00:30 elapsed, about 0:01:30 left.",
-        "Fitting frames: 6/12, 0:01:00 elapsed, about 0:01:00 left.",
-        "Fitting frames: 9/12, 0:01:30 elapsed, about 0:00:30 left.",
-        "Fitting frames: 12/12, 0:02:00 elapsed, about 0:00:00 left.",
+        "Fitting frames: 3/12, 30 s elapsed, about 2 min left.",
+        "Fitting frames: 6/12, 60 s elapsed, about 60 s left.",
+        "Fitting frames: 9/12, 2 min elapsed, about 30 s left.",
+        "Fitting frames: 12/12, 2 min elapsed, about 0 s left.",
     ]
 
 
@@ -49,8 +49,8 @@ def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(caps
             report("Later frames", done, 10)
             clock += 20.0
     assert capsys.readouterr().err.splitlines() == [
-        "Later frames: 6/10, 0:00:00 elapsed.",
-        "Later frames: 7/10, 0:00:40 elapsed, about 0:01:40 left.",
+        "Later frames: 6/10, 0 s elapsed.",
+        "Later frames: 7/10, 40 s elapsed, about 2 min left.",
     ]
 
 

@@ -125,8 +125,8 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
     [
         (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
         (
-            ["--test-view", "3"],
-            ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3"),
+            ["--hold-out", "3"],
+            ("--hold-out must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3"),
         ),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
         (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
@@ -175,7 +175,7 @@ def test_fit__takes_the_held_out_camera_by_index_or_name(
     capture, tmp_path, run, monkeypatch, view, test_views
 ):
     assert (
-        fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", *view).test_views
+        fitted_capture(monkeypatch, run, capture, tmp_path, "--hold-out", *view).test_views
         == test_views
     )
 
@@ -257,7 +257,7 @@ def test_fit__reports_progress_before_the_first_frame(capture, tmp_path, run, mo
     monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *OPTIONS)
     assert status == 130
-    assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")
+    assert error.startswith("Matching views: 0/3, 0 s elapsed.\nMatching views: 1/3, ")
     assert "Triangulating points: 0/1, " in error
 
 
@@ -300,7 +300,7 @@ def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_c
     clip = write_recording(tmp_path / "clip", 2)
     for image in clip.glob("cam*/0000.png"):
         write_png(image, np.zeros((24, 32, 3), np.uint8))
-    status, output, _ = run("fit", clip, tmp_path / "out", *OPTIONS, "--test-view", "none")
+    status, output, _ = run("fit", clip, tmp_path / "out", *OPTIONS, "--hold-out", "none")
     (first, second) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert (status, second["status"]) == (0, "ok")
     assert "the image is black; cut such frames off" in first["status"]

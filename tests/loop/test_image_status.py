@@ -44,7 +44,7 @@ def test_image_status__names_views_of_one_colour(image: np.ndarray, words: str) 
     for previous_status in ({}, RIG):
         (problem,) = image_status(NAMES, previous_status, {**RIG, 1: image})
         assert problem.startswith(words)
-        assert "--without" in problem
+        assert "--exclude" in problem
 
 
 def test_image_status__names_a_cut_of_all_views_or_of_one() -> None:

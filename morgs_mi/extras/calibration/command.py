@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -15,14 +15,31 @@ from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional, arg
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.points import match_capture, triangulate_points
-from morgs_mi.cli.console import print_result, print_table, print_warning, progress
-from morgs_mi.cli.settings import Flag, GivenReading, Reading, Without, optional
+from morgs_mi.cli.console import (
+    print_next,
+    print_result,
+    print_table,
+    print_warning,
+    progress,
+    quantity,
+)
+from morgs_mi.cli.settings import (
+    Flag,
+    GivenReading,
+    Reading,
+    Without,
+    optional,
+    options,
+)
+from morgs_mi.cli.streams import opened
+from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.calibrate import CalibrateConfig
 from morgs_mi.extras.calibration.checks.plots import write_rig
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.extras.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.fit.forecast import forecast
+from morgs_mi.playback.default_rig import DEFAULT_RIG
 
 # Columns of a camera, after its index and name.
 _COLUMNS = (
@@ -45,14 +62,14 @@ _UNCERTAIN_WHY = (
 )
 
 
-@dataclass(frozen=True)
+@options
 class Info:
     """List the contents of a capture: layout, cameras, sizes, frames, points; check its poses
-    against the images.
+    against the images. Of a stream or a file: its Gaussians.
     """
 
-    capture: Positional[Path]
-    """Folder of the capture."""
+    capture: Annotated[Positional[Path], arg(metavar="SOURCE")]
+    """Folder of a capture or a fit, a stream file, or a file of Gaussians."""
     plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
     """File for a plot of the rig, .png, .jpg, .svg or .pdf."""
     check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
@@ -67,6 +84,9 @@ class Info:
         if self.plot is not None:
             check_output(self.plot)
             check_plot(self.plot)
+        if self.capture.is_file() or (self.capture / STREAM).is_file():
+            _print_stream(self.capture)
+            return
         capture = load_capture(self.capture, reading=self.reading.read_config())
         points = f"{len(capture.points)} points" if len(capture.points) else "without points"
         rig_check = None
@@ -92,7 +112,8 @@ class Info:
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
         for note in capture.notes:
             print_result(note)
-        print_table(_camera_table(capture, rig_check))
+        dispensable = ("centre, px", "size", "focal, px", "seen")
+        print_table(_camera_table(capture, rig_check), dispensable)
         if self.time:
             with progress() as report:
                 offsets = estimate_time_offsets(capture, partial(report, "Comparing clocks"))
@@ -101,9 +122,22 @@ class Info:
         if self.plot is not None:
             write_rig(self.plot, capture)
             print_result(f"Plot of the rig: {self.plot}")
+        print_next("fit", self.capture, f"{self.capture.resolve().name}-fit")
 
 
-@dataclass(frozen=True)
+def _print_stream(path: Path) -> None:
+    """Print what a stream, or a file of Gaussians, has in its first frame."""
+    stream = opened(path, drop_invalid=False)
+    frames = quantity(len(stream.frame_numbers()), "frame")
+    gaussians = next(stream.states()).gaussians
+    memory = sum(value.nbytes for value in gaussians.numpy().values())
+    rig = "cameras around it" if DEFAULT_RIG in stream.metadata else "cameras"
+    print_result(f"{stream.path}: {frames} at {stream.fps:g} fps, {len(stream.cameras)} {rig}.")
+    print_result(f"{gaussians}, {memory / 1e6:.1f} MB of memory.")
+    print_next("view", path)
+
+
+@options
 class Calibrate:
     """Calibrate the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
 
@@ -112,7 +146,7 @@ class Calibrate:
     config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(
         default_factory=CalibrateConfig
     )
-    without: Without = ()
+    exclude: Without = ()
     """Cameras that are left out, by name."""
     overwrite: Flag = False
     """Replace an earlier model in FOLDER/sparse."""
@@ -126,7 +160,7 @@ class Calibrate:
                 self.config,
                 self.overwrite,
                 lambda *stage: report(*stage),
-                self.without,
+                self.exclude,
             )
         table = _check_table(str(result.model), ("camera", "points", "error, px", "pose"))
         for check in result.checks:
@@ -140,6 +174,7 @@ class Calibrate:
             f"reprojection error {result.error:.2f} px, by {result.mapper} mapping{points}; scale "
             "and up direction of its world are arbitrary."
         )
+        print_next("info", self.folder)
 
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:

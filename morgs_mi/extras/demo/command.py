@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import Settings, optional, setting
+from morgs_mi.cli.console import print_next, print_result, print_table, progress
+from morgs_mi.cli.settings import (
+    Settings,
+    optional,
+    options,
+    setting,
+)
 from morgs_mi.evaluate.tables import figure
 from morgs_mi.extras.demo.demo import DemoConfig
 
@@ -25,7 +30,7 @@ _SCORES = {
 }
 
 
-@dataclass(frozen=True)
+@options
 class Demo:
     """Synthesise a clip, reconstruct it with and without learned motion, and write figures and a
     report to OUT.
@@ -36,7 +41,7 @@ class Demo:
 
     out: Positional[Path]
     """Folder for all results; those of an earlier demo are replaced."""
-    scene: str = _DEFAULT.scene
+    scene: Annotated[str, arg(metavar="SCENE")] = _DEFAULT.scene
     """Name of a scene (spheres, arm, thin, flicker, random) or its Python file."""
     cameras: Annotated[int | None, DisallowNone] = _DEFAULT.clip.cameras
     """Number of cameras, the held-out cam00 included."""
@@ -89,3 +94,4 @@ class Demo:
             f"{self.out / 'contact_sheet.png'}"
         )
         print_result(f"All results: {self.out / 'report.json'}")
+        print_next("view", self.out)

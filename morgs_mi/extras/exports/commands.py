@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import quantity
-from morgs_mi.cli.settings import Flag, place
+from morgs_mi.cli.settings import (
+    Flag,
+    options,
+    place,
+)
 from morgs_mi.cli.streams import FRAMES, ExportKind, relative_to
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import GLTF, USD, Format
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
 
-@dataclass(frozen=True)
+@options
 class Gltf(ExportKind):
     """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
 
@@ -42,7 +45,7 @@ class Gltf(ExportKind):
         return quantity(len(frames), "glTF file") + relative_to(stream)
 
 
-@dataclass(frozen=True)
+@options
 class Usd(ExportKind):
     """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to
     y up.

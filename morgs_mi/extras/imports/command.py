@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import setting
+from morgs_mi.cli.console import print_next, print_result, progress
+from morgs_mi.cli.settings import (
+    options,
+    setting,
+)
 from morgs_mi.cli.streams import DropInvalid
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
 
-_PATHS = (
-    "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the "
-    "order of the frames. Last, OUT: a folder for stream.morgs, or a new file whose name ends in "
-    ".morgs."
-)
 
-
-@dataclass(frozen=True)
+@options
 class Import:
     """Write frames of other tools, one file of Gaussians each, as a stream."""
 
     # One list, as for `cp`: the parser cannot split two of them where options follow.
     paths: Annotated[
         Positional[tuple[Path, ...]],
-        arg(metavar="FRAMES [FRAMES ...] OUT", help=_PATHS, help_behavior_hint=""),
+        arg(metavar="FRAMES [FRAMES ...] OUT", help_behavior_hint=""),
     ] = ()
+    """Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the
+    order of the frames. Last, OUT: a folder for stream.morgs, or a new file whose name ends in
+    .morgs.
+    """
     fps: float = 30.0
     """Frames per second."""
     axes: Annotated[Axes, arg(metavar="NAME")] = "y-down"
@@ -71,3 +72,4 @@ class Import:
             f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
             f"{result.num_bytes / 1e6:.2f} MB."
         )
+        print_next("view", out)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +15,13 @@ import mitsuba as mi
 import numpy as np
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, print_warning, progress
-from morgs_mi.cli.settings import Flag, Settings, setting
+from morgs_mi.cli.console import print_next, print_result, print_warning, progress
+from morgs_mi.cli.settings import (
+    Flag,
+    Settings,
+    options,
+    setting,
+)
 from morgs_mi.core.fit_names import STREAM
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 
@@ -26,7 +31,7 @@ if TYPE_CHECKING:
 _PERIOD = 1.0  # least time between two lines about frames, s
 
 
-@dataclass(frozen=True)
+@options
 class LiveSettings(Settings):
     """Settings of a live fit, with its own defaults."""
 
@@ -36,7 +41,7 @@ class LiveSettings(Settings):
     """Passes over the views for every later frame."""
 
 
-@dataclass(frozen=True)
+@options
 class Live:
     """Reconstruct what cameras see, while they see it, into OUT/stream.morgs; Ctrl-C ends it.
 
@@ -90,6 +95,7 @@ class Live:
 
             rows = fit_live(sources, out, self.live, config, on_frame, on_stage)
         print_result(_summary(out, rows))
+        print_next("view", out)
 
 
 class _Lines:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
+from tyro.conf import arg
 
 from morgs_mi.core.checks import require
 from morgs_mi.core.config import Count, Positive, check_ranges
@@ -26,11 +27,11 @@ class LiveConfig:
     """Folder of a calibrated capture of the same cameras; by default they are calibrated by their
     first images.
     """
-    without: tuple[str, ...] = ()
+    without: Annotated[tuple[str, ...], arg(name="exclude", metavar="CAMERA ...")] = ()
     """Calibrated cameras that are left out, by name."""
     downscale: Annotated[float, Ge(1)] = 1
     """Factor by which the images are reduced."""
-    test_view: tuple[str, ...] = ()
+    test_view: Annotated[tuple[str, ...], arg(name="hold-out", metavar="CAMERA ...")] = ()
     """Held-out cameras, by indices or names; by default all are fitted."""
     frames: Count | None = None
     """Number of frames to fit; by default as many as come."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,11 +10,19 @@ from rich.table import Table
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import Flag, HeldOut, Settings, held_out, optional, place
+from morgs_mi.cli.settings import (
+    Flag,
+    HeldOut,
+    Settings,
+    held_out,
+    optional,
+    options,
+    place,
+)
 from morgs_mi.loop.stream_config import PresetName
 
 
-@dataclass(frozen=True)
+@options
 class Sweep:
     """Fit and score a capture with several presets, numbers of epochs and seeds: error against run
     time.
@@ -43,7 +50,7 @@ class Sweep:
     """Loss of PSNR up to which a part is not needed, dB."""
     downscale: float = 1
     """Factor by which the images are reduced."""
-    test_view: HeldOut = ("auto",)
+    hold_out: HeldOut = ("auto",)
     """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0
     of six or more.
     """
@@ -59,7 +66,7 @@ class Sweep:
         plot = self.out / f"{name}.png"
         check_plot(plot)
         config = Settings(config=self.config).stream_config()
-        capture = load_capture(self.capture, self.downscale, held_out(self.test_view))
+        capture = load_capture(self.capture, self.downscale, held_out(self.hold_out))
         common = (self.seeds, self.frames, self.out, config)
         with progress() as report:
             if self.leave_out:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import DisallowNone, OmitArgPrefixes, Positional, arg
 
-from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import Flag
+from morgs_mi.cli.console import print_next, print_result, progress
+from morgs_mi.cli.settings import (
+    Flag,
+    options,
+)
 from morgs_mi.extras.synth.synth_config import SynthConfig
 
 
-@dataclass(frozen=True)
+@options
 class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
@@ -45,3 +48,4 @@ class Synth:
         cameras = len(list((self.out / "truth").glob("cam*")))
         size = f"{config.frames} frames of {config.width}x{config.height}"
         print_result(f"{self.out}: {cameras} cameras, {size} as {images}, with ground truth.")
+        print_next("fit", self.out, self.out.with_name(f"{self.out.name}-fit"))

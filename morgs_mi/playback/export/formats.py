@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from morgs_mi.capture.outputs import check_output
+from morgs_mi.core.fit_names import STREAM
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ def destination(
     """Return the path of an export and its format.
 
     Args:
-        stream: path of the stream, beside which an output without a name is written.
+        stream: path of the stream, beside which an output without a name is written; the name of a
+            file begins with its own.
         output: the given file or folder, or None.
         formats: formats of the export.
         stem: name of a camera or a path, for the name of the output.
@@ -93,7 +95,9 @@ def destination(
             written, or the output is the stream itself, by any of its names.
     """
     choice = choose_format(formats, output)
-    path = check_output(output or stream.with_name(choice.default.format(stem)))
+    # Files of several scenes may lie in one folder.
+    scene = "" if stream.name == STREAM else f"{stream.name.partition('.')[0]}-"
+    path = check_output(output or stream.with_name(scene + choice.default.format(stem)))
     if choice.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
     if path.exists() and stream.exists() and path.samefile(stream):

@@ -151,7 +151,7 @@ def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraChe
             reasons.setdefault(
                 view,
                 f"it has the same pose as {checks[sum(pair) - view].name}: give each camera its "
-                "own, or leave the copy out (--without)",
+                "own, or leave the copy out (--exclude)",
             )
     results = list(checks)
     for view, advice in reasons.items():

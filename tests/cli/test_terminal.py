@@ -1,0 +1,75 @@
+"""What the commands print on terminals of 80 and 100 columns."""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.cli.export import EXPORTS
+from morgs_mi.cli.main import COMMANDS, main
+
+NAMES = [(), *((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]
+
+
+def on_terminal(columns: int, *args: str | Path) -> str:
+    """Return what a command prints on a terminal, without its colours."""
+    parent, child = pty.openpty()
+    fcntl.ioctl(child, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    environment = {k: v for k, v in os.environ.items() if k != "COLUMNS"} | {"TERM": "xterm"}
+    command = [sys.executable, "-m", "morgs_mi", *map(str, args)]
+    with subprocess.Popen(command, stdin=child, stdout=child, stderr=child, env=environment):
+        os.close(child)
+        output = b""
+        while True:
+            try:
+                part = os.read(parent, 2**16)
+            except OSError:  # the process has ended
+                break
+            if not part:
+                break
+            output += part
+    os.close(parent)
+    return re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", output.decode()).replace("\r", "\n")
+
+
+@pytest.mark.parametrize("columns", [80, 100])
+@pytest.mark.parametrize("command", NAMES)
+def test_help__fits_the_terminal_without_orphan_lines(command, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit):
+        main([*command, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= columns
+    assert not re.search(r"\(default:\s*(None)?\)|\bSTR\b", "\n".join(lines))
+    for line, following in itertools.pairwise(lines):
+        indent = len(following) - len(following.lstrip())
+        # A line of the same paragraph begins with a word that did not fit.
+        if indent > 10 and line[: indent - 1].isspace() and line[indent : indent + 1].strip():
+            assert len(line) + 1 + len(following.split()[0]) > columns - 2, following
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("columns", [80, 100])
+def test_commands__print_whole_words_on_a_terminal(columns, fitted_clip, tmp_path):
+    for args in (
+        ("info", fitted_clip / "capture"),
+        ("eval", fitted_clip, "--frames", "2"),
+        ("render", fitted_clip, tmp_path / "long-name-of-a-folder-of-images-png", "--camera", "0"),
+        ("fit", fitted_clip / "missing", tmp_path / "out"),
+    ):
+        text = on_terminal(columns, *args)
+        assert text.strip()
+        # Only a path that is longer than the terminal is broken.
+        lines = [line for line in text.splitlines() if " " in line.strip()]
+        assert max(map(len, lines)) <= columns, text
+        assert "Traceback" not in text
