@@ -102,7 +102,7 @@ class CameraSource:
             # The cubic filter rings less in encoded values, in which lamps are less far from their
             # surroundings.
             image = np.maximum(decode_light(self.undistortion(encode_light(image))), 0)
-        size = (camera.width, camera.height)
+        size = camera.size
         if image.shape[1::-1] != size:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if self.display_exposure is not None:

@@ -435,7 +435,7 @@ def _at_clip_sizes(
                 "the size of the images."
             )
         recorded.append(camera.resized(width, height))
-        if (width, height) != (camera.width, camera.height):
+        if (width, height) != camera.size:
             scaled.append(recorded[-1])
     if scaled:
         _LOG.warning(

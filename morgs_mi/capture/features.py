@@ -256,7 +256,7 @@ def intersect(
     positions = np.array([camera.position for camera in cameras])
     middle = positions.mean(0)
     scale = np.linalg.norm(positions - middle, axis=1).max() or 1.0
-    V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
+    V = np.array([camera.world_to_camera[:3] for camera in cameras])
     V[:, :, 3] = (V[:, :, :3] @ middle + V[:, :, 3]) / scale
     V = V[views]
     K = np.array([camera.K for camera in cameras])[views]

@@ -68,7 +68,7 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
 
 def _fundamental(a: Camera, b: Camera) -> np.ndarray:
     """Return the fundamental matrix [3, 3], by which a pixel of `a` has its line in `b`."""
-    relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
+    relative = b.world_to_camera @ np.linalg.inv(a.world_to_camera)
     essential = np.cross(relative[:3, 3], relative[:3, :3], axisb=0, axisc=0)
     return np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
 

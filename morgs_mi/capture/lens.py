@@ -134,7 +134,7 @@ def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """
     K = camera.K.copy()
     K[:2, 2] -= 0.5
-    size = (camera.width, camera.height)
+    size = camera.size
     fisheye = lens.model == "OPENCV_FISHEYE"
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)

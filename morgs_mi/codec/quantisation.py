@@ -341,7 +341,7 @@ def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray
     """
     pixel = np.full(len(means), np.inf)
     for camera in cameras:
-        view = np.asarray(camera.viewmat, np.float64)
+        view = camera.world_to_camera
         depth = means @ view[2, :3] + view[2, 3]
         focal = max(camera.K[0, 0], camera.K[1, 1])
         pixel = np.minimum(pixel, np.where(depth > camera.near, depth, np.inf) / focal)

@@ -200,25 +200,33 @@ class Camera:
         return np.rad2deg(2 * np.arctan(0.5 * self.width / self.K[0, 0]))
 
     @property
-    def _world_to_camera(self) -> np.ndarray:
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.width, self.height
+
+    @property
+    def world_to_camera(self) -> np.ndarray:
         """The extrinsics [4, 4] in NumPy, float64, without gradients."""
-        return np.asarray(self.viewmat, dtype=np.float64)
+        return np.asarray(self.viewmat, np.float64)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """Rotation [3, 3] of the extrinsics; its rows are the camera's right, down and forward."""
+        return self.world_to_camera[:3, :3]
 
     @property
     def position(self) -> np.ndarray:
         """The camera's centre [3] in world units."""
-        V = self._world_to_camera
-        return -V[:3, :3].T @ V[:3, 3]
+        return -self.rotation.T @ self.world_to_camera[:3, 3]
 
     @property
     def to_world(self) -> np.ndarray:
         """Mitsuba's `to_world` matrix [4, 4]: camera -> world with x to the left and y up."""
-        return np.linalg.inv(self._world_to_camera) @ _OPENCV_FROM_MITSUBA
+        return np.linalg.inv(self.world_to_camera) @ _OPENCV_FROM_MITSUBA
 
     def _local(self, points: np.ndarray) -> np.ndarray:
         """Return world points [..., 3] in the camera's coordinates."""
-        V = self._world_to_camera
-        return points @ V[:3, :3].T + V[:3, 3]
+        return points @ self.rotation.T + self.world_to_camera[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixel positions [..., 2] and the depths z [...] of world points [..., 3].
@@ -232,12 +240,11 @@ class Camera:
         """Return the world points [..., 3] at pixel positions [..., 2] and depths z [...]: the
         inverse of `project`.
         """
-        V = self._world_to_camera
         K = self.K
         x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
         y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
         local = np.stack([x, y, np.ones_like(x)], axis=-1) * np.asarray(depths)[..., None]
-        return (local - V[:3, 3]) @ V[:3, :3]
+        return (local - self.world_to_camera[:3, 3]) @ self.rotation
 
     def rays(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the origin [3] and the unit directions [..., 3] of the rays through pixel
@@ -256,7 +263,7 @@ class Camera:
         fy = self.K[1, 1] * inverse
         zero = np.zeros_like(z)
         rows = [fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse]
-        return np.stack(rows, axis=1).reshape(-1, 2, 3) @ self._world_to_camera[:3, :3]
+        return np.stack(rows, axis=1).reshape(-1, 2, 3) @ self.rotation
 
     def without_delays(self) -> Camera:
         """Return the same view with images of the timestamps themselves: no delay and no rolling

@@ -63,17 +63,14 @@ def moved(cameras: Sequence[Camera], origin: np.ndarray) -> tuple[Camera, ...]:
     """Return the cameras relative to a point `origin` [3] of the world."""
     shift = np.eye(4)
     shift[:3, 3] = origin
-    return tuple(
-        replace(camera, viewmat=np.asarray(camera.viewmat, np.float64) @ shift)
-        for camera in cameras
-    )
+    return tuple(replace(camera, viewmat=camera.world_to_camera @ shift) for camera in cameras)
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the mean up direction of the cameras [3], of unit length; the first camera's where
     they cancel out.
     """
-    ups = np.stack([-np.asarray(camera.viewmat, np.float64)[1, :3] for camera in cameras])
+    ups = np.stack([-camera.rotation[1] for camera in cameras])
     mean = ups.mean(axis=0)
     up = mean if np.linalg.norm(mean) > 0.1 else ups[0]
     return up / np.linalg.norm(up)
@@ -88,7 +85,7 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     system = 1e-9 * np.eye(3)
     right = np.zeros(3)
     for camera in cameras:
-        axis = np.asarray(camera.viewmat, float)[2, :3]
+        axis = camera.rotation[2]
         across = np.eye(3) - np.outer(axis, axis)
         system = system + across
         right = right + across @ (camera.position - middle)
@@ -101,7 +98,7 @@ def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
     """
     focus = np.append(focus_point(cameras), 1)
     least = 1e-3 * scene_extent(cameras)
-    depths = np.array([np.asarray(camera.viewmat, float)[2] @ focus for camera in cameras])
+    depths = np.array([camera.world_to_camera[2] @ focus for camera in cameras])
     return np.where(depths > least, depths, np.inf)
 
 
@@ -117,7 +114,7 @@ def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def in_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Return the mask [...] of the pixel positions [..., 2] that lie in the image of a camera."""
-    return np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=-1)
+    return np.all((pixels >= 0) & (pixels < camera.size), axis=-1)
 
 
 def with_near_planes(

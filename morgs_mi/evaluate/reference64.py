@@ -50,7 +50,7 @@ def reference64(
     }
     dr.enable_grad(columns)
     means, scales, (w, *xyz), (logits,), sh = columns.values()
-    view = np.asarray(camera.viewmat, np.float64)
+    view = camera.world_to_camera
     R = types.Matrix3f64(view[:3, :3])
     t = types.Array3f64(view[:3, 3])
     point = R @ types.Array3f64(means) + t

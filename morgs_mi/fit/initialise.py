@@ -113,7 +113,7 @@ def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     """
     mask = np.zeros(len(means), bool)
     for camera in cameras:
-        forward = np.asarray(camera.viewmat, np.float64)[2]
+        forward = camera.world_to_camera[2]
         depths = means @ forward[:3] + forward[3]
         near = np.flatnonzero((depths > 0) & (depths < camera.near))
         pixels, _ = camera.project(np.asarray(means[near], np.float64))
@@ -224,7 +224,7 @@ def fill_points(
         _, point_pixels, depths = seen_points(view.camera, points[0])
         if not len(point_pixels):
             continue
-        size = (view.camera.width, view.camera.height)
+        size = view.camera.size
         pixels = rng.uniform(0, size, (len(share), 2))
         point_cells, cells = ((p * _CELLS / size).astype(int) for p in (point_pixels, pixels))
         is_free = np.ones((_CELLS, _CELLS), bool)

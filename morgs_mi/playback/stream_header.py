@@ -211,7 +211,7 @@ def open_stream_capture(
         path, downscale, "auto" if test_view == "auto" else None, stop, reading
     )
     sizes, recorded_sizes = (
-        {camera.name: (camera.width, camera.height) for camera in cameras}
+        {camera.name: camera.size for camera in cameras}
         for cameras in (stream.cameras, recording.cameras)
     )
     if recorded_sizes == sizes and test_view != "auto":

@@ -179,7 +179,7 @@ def write_colmap(
     image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points\n"]
     camera_lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n"]
     for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
-        viewmat = np.asarray(camera.viewmat, np.float64)
+        viewmat = camera.world_to_camera
         x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat(canonical=True).tolist()
         name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
         image_lines.append(_line(i, w, x, y, z, *viewmat[:3, 3].tolist(), i, name))

@@ -75,7 +75,7 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
                 f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
                 f"centred principal point, got K={camera.K.tolist()}; use write_colmap()."
             )
-        right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
+        right, down, forward = camera.rotation
         hwf = [camera.height, camera.width, f]
         pose = np.stack([down, right, -forward, camera.position, hwf], axis=1)
         rows.append([*pose.ravel(), *near_far])

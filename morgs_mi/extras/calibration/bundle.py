@@ -148,7 +148,7 @@ def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     K[:2, 2] += changes[7:9] * camera.width
     turn = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0]
     V = np.eye(4)
-    V[:3, :3] = turn @ np.asarray(camera.viewmat)[:3, :3]
+    V[:3, :3] = turn @ camera.rotation
     V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
     return replace(camera, K=K, viewmat=V)
 
@@ -198,7 +198,7 @@ def camera_jacobian(
         points: [n, 3], world units; the derivatives of points behind the near plane are zero.
         distortion: k [2] so far, of images that are not undistorted by it.
     """
-    R = np.asarray(camera.viewmat, np.float64)[:3, :3]
+    R = camera.rotation
     x = (points - camera.position) @ R.T
     front = x[:, 2] > camera.near
     of_changes = np.zeros((len(x), 2, CHANGES))

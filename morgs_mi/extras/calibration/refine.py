@@ -389,7 +389,7 @@ def _sizes(cameras: Sequence[Camera], changes: np.ndarray) -> list[float]:
     """
     shifts = []
     for camera, change in zip(cameras, changes, strict=True):
-        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * (camera.width, camera.height)
+        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * camera.size
         shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
     vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
     return [float(np.linalg.norm(each, axis=1).max()) for each in vectors]

@@ -189,7 +189,7 @@ class _Clips:
                     raise image
                 clip.append(image)
             view = View(camera, clip[0], capture.masks[index]).reduced(_WIDTH)
-            size = (view.camera.width, view.camera.height)
+            size = view.camera.size
             images.append([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in clip])
             # The images are whole frames: with the capture's delays they would be displaced twice.
             cameras.append(view.camera.without_delays())

@@ -153,7 +153,7 @@ def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
     first one's right.
     """
     up = up_direction(cameras)
-    views = np.asarray(cameras[0].viewmat, np.float64)
+    views = cameras[0].world_to_camera
     right, forward = (side - (side @ up) * up for side in (views[0, :3], views[2, :3]))
     if np.linalg.norm(right) < 0.5:  # the camera is rolled by 90 degrees: its right is nearly up
         right = forward

@@ -89,7 +89,7 @@ def light_probe(
         image = np.asarray(rasterize(gaussians, camera, ("color",), background).color)
         on_face = ((axis == k) & (sign * largest > 0))[..., None]
         # What other faces show may be behind this camera.
-        seen_directions = np.where(on_face, directions, np.asarray(camera.viewmat)[2, :3])
+        seen_directions = np.where(on_face, directions, camera.rotation[2])
         pixels, _ = camera.project(camera.position + seen_directions)
         x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
         color = np.where(on_face, cv2.remap(image, x, y, cv2.INTER_LINEAR), color)

@@ -74,7 +74,7 @@ def compute_ground_truth(
     """
     # A point in front of the camera where there is no surface avoids a division by zero; its values
     # are not used.
-    front = camera.position + np.asarray(camera.viewmat)[2, :3]
+    front = camera.position + camera.rotation[2]
     points = np.where((surface.ids >= 0)[..., None], surface.positions, front)
     pixels, depth = camera.project(points)
     other = move_with_objects(

@@ -201,5 +201,5 @@ class PathTracer:
         ray.maxt = mi.Float((1 - _OWN_SURFACE) * distance)
         is_free = ~np.array(self._scene.ray_test(ray))
         pixels, depth = camera.project(points)
-        mask = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=-1)
+        mask = np.all((pixels >= 0) & (pixels < camera.size), axis=-1)
         return is_free & (depth > camera.near) & mask

@@ -94,7 +94,7 @@ class CameraPath:
         # Not at the start of every command, which it slows down.
         from scipy.interpolate import CubicSpline
 
-        views = [np.asarray(key.viewmat, np.float64)[:3, :3].T for key in self.keys]
+        views = [key.rotation.T for key in self.keys]
         positions = np.stack([key.position for key in self.keys])
         K = np.stack([key.K for key in self.keys])
         # With logarithms the focal lengths stay positive where the spline overshoots.
@@ -113,7 +113,7 @@ def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     parallel axes.
     """
     weight = _MEDIAN_WEIGHT * len(cameras)
-    axes = np.array([np.asarray(camera.viewmat, np.float64)[2, :3] for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
     positions = np.array([camera.position for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     A = weight * np.eye(3) + across.sum(axis=0)

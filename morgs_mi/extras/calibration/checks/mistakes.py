@@ -61,7 +61,7 @@ _LEAST_FACTOR = 0.1
 def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Return the pairs of cameras with the same pose."""
     positions = np.array([camera.position for camera in cameras])
-    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
+    rotations = np.array([camera.rotation for camera in cameras])
     near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
     same = np.linalg.norm(positions[:, None] - positions, axis=-1) <= near
     same &= np.abs(rotations[:, None] - rotations).max(axis=(2, 3)) < _SAME
@@ -115,7 +115,7 @@ def rig_candidates(
 
 def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
     """Yield the corrected camera for each mistake that concerns a single pose."""
-    pose = np.asarray(camera.viewmat, np.float64)
+    pose = camera.world_to_camera
     for rotation, sentence in _CAMERA_MISTAKES:
         yield replace(camera, viewmat=rotation @ pose), sentence
     # A turned pose keeps the principal point; a turned image has the opposite one.

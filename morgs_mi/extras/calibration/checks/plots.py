@@ -77,7 +77,7 @@ def draw_rig(
     # The centre of each camera, and the corners of its image at a depth.
     frusta = []
     for camera in cameras:
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * camera.size
         frusta += [camera.position, *camera.unproject(corners, np.full(4, 0.25 * radius))]
     frusta = np.array(frusta) - middle
     places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in points)
@@ -122,7 +122,7 @@ def draw_rig(
 def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
     up = up_direction(cameras)
-    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
+    rotations = np.array([camera.rotation for camera in cameras])
     # Forward is the first of these that is not vertical. Cameras all around a scene have no common
     # forward direction: use the first camera's direction.
     candidates = np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
