@@ -10,8 +10,8 @@ from .core.progress import ProgressBar
 from .core.rig import with_near_planes
 from .evaluate.accuracy import accuracy
 from .evaluate.evaluate import evaluate_stream
+from .extras.light.insert import shadow_ratio, shadowed
 from .extras.light.light_probe import light_probe
-from .extras.light.shadows import shadow_ratio, shadowed
 from .extras.live.sources import live_frames
 from .extras.sweep.sweep import leave_out, sweep
 from .extras.synth.synth_config import SynthConfig

@@ -31,8 +31,7 @@ from morgs_mi.core.threads import in_background
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.loop.first_frame import corrected, fitted_first_frame, with_first_confidence
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.image_status import image_status
-from morgs_mi.loop.input_images import Frame, as_array, in_order
+from morgs_mi.loop.input_images import Frame, as_array, image_status, in_order
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,

@@ -7,7 +7,7 @@ docs/experiments/stability.md.
 
 The cases are shared with the tests (`tests.scenes.extremes`, `tests.scenes.hard_fits`). Image and
 gradients are compared with a reference in extended precision, a million Gaussians with
-`morgs_mi.evaluate.reference64`. A row has its `kind` and `name`, the errors of the image and of the
+`morgs_mi.evaluate.accuracy`. A row has its `kind` and `name`, the errors of the image and of the
 gradient by attribute, the seconds of an image with its gradients after a warm-up, and the condition
 number, if it is one of a ladder; or the sentence that is raised; or the PSNR of the first and the
 last frame of a fit.

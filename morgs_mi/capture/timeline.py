@@ -26,11 +26,10 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.layouts.clips import check_names
-from morgs_mi.core.bounded import read_json
+from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.config import config_class
 from morgs_mi.io.numbering import counting_together
-from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import FolderReader, FrameReader
 
 _LOG = logging.getLogger(__name__)

@@ -23,10 +23,10 @@ from morgs_mi.codec.container import (
     PacketKind,
     TruncatedStreamError,
     decode_packet,
+    header_fields,
     open_packet,
 )
 from morgs_mi.codec.frame_source import FrameSource
-from morgs_mi.codec.header import header_fields
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.core.bounded import open_regular
 

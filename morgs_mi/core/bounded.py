@@ -10,6 +10,7 @@ Text is UTF-8, with or without a byte order mark. Settings have at most 256 kB, 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import stat
@@ -17,7 +18,7 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -25,7 +26,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from morgs_mi.core.checks import require
+from morgs_mi.core.checks import few, require
 
 _FACTOR = 10
 _ALLOWANCE = 200_000_000
@@ -213,3 +214,14 @@ def _refusing(path: str | Path, expected: str, remedy: str) -> Iterator[None]:
         raise ValueError(
             f"{path}: expected {expected}, got a broken file ({error}); {remedy}."
         ) from None
+
+
+_LOG = logging.getLogger(__name__)
+
+
+def warn_unread(path: Path, names: Iterable[str]) -> None:
+    """Name in one warning the entries of a file that are not understood, if there are any; a name
+    may occur often.
+    """
+    if unread := sorted(set(names)):
+        _LOG.warning("%s: not understood and not used: %s.", path, few(unread))

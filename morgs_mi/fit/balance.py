@@ -20,7 +20,7 @@ from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, rendered, withheld_blocks
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
 

@@ -152,7 +152,7 @@ class FitConfig:
     """Time that the first frame may take on two cores of a server: it limits those numbers of
     Gaussians and of steps that are not given."""
     dropout: Annotated[float, Ge(0), Lt(1)] | None = None
-    """Probability with which each step of the first frame leaves a Gaussian out (see `dropout`);
+    """Probability with which each step of the first frame leaves a Gaussian out (see `dropped`);
     None: from the noise of the images and the angles between the views."""
     noise_aware: bool = True
     """Fit the first frame to noisy images by L1 alone: SSIM makes the fit follow their noise."""

@@ -19,11 +19,9 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.balance import balance_cameras, balance_config
 from morgs_mi.fit.budget import plan_first_frame
-from morgs_mi.fit.dropout import adapted_to_images
-from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
+from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.fit.initialise import MIN_POINTS
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import MIN_POINTS, FirstFrameProblem
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.input_images import Frame
 from morgs_mi.loop.observation import (

@@ -42,8 +42,7 @@ from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 from morgs_mi.method.motion_start import MotionStart
-from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.view_group import ViewGroup
+from morgs_mi.render.active_view import ActiveView, ViewGroup
 
 # Numbers of a pixel that are summed per Gaussian.
 _FLOW_MAPS = 4

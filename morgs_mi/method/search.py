@@ -46,7 +46,7 @@ _COST_RATIO = 0.3
 # Error of the images around a part, relative to the error without the displacement, up to which it
 # is accepted.
 _ERROR_RATIO = 0.8
-# Logit of the confidence of a Gaussian that was found, see `propagation`.
+# Logit of the confidence of a Gaussian that was found, see `motion`.
 _LOGIT = 0.3
 
 

@@ -22,10 +22,9 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Float
 from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.active_view import ActiveView, Drawing, ViewGroup
 from morgs_mi.render.backend import elements
 from morgs_mi.render.projection import concatenated
-from morgs_mi.render.view_group import Drawing, ViewGroup
 
 _Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
 

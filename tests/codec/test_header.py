@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.header import header_fields, header_json, load_json
+from morgs_mi.codec.container import StreamWriter, header_fields, header_json, load_json
 from morgs_mi.core.camera import Camera
 from tests.scenes.coded_clip import CAMERAS
 

@@ -11,8 +11,7 @@ from rich.console import Console
 from benchmarks.workloads import ball
 from morgs_mi import RenderConfig, accuracy
 from morgs_mi.evaluate import accuracy as module
-from morgs_mi.evaluate import reference64 as reference_module
-from morgs_mi.evaluate.reference64 import ATTRIBUTES, reference64
+from morgs_mi.evaluate.accuracy import ATTRIBUTES, reference64
 from tests import reference
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import as_float32, make_scene, to_gaussians
@@ -20,7 +19,7 @@ from tests.scenes.gaussians import as_float32, make_scene, to_gaussians
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_reference64__agrees_with_the_reference_of_the_tests(antialiased, monkeypatch):
-    monkeypatch.setattr(reference_module, "PAIRS", 200)  # several chunks of pixels
+    monkeypatch.setattr(module, "PAIRS", 200)  # several chunks of pixels
     raw = as_float32(make_scene(3, 6, logits=(-1.5, 7)))  # some pixels reach the cap of alpha
     raw["means"][0] = (0, 0, -9)  # behind the camera
     camera = make_camera(13, 9)

@@ -14,7 +14,7 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import View
 from morgs_mi.method.exposure import Exposure
 from tests.scenes.cameras import QUAD, look_at_cameras

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
-from morgs_mi.fit.dropout import adapted_to_images, dropped
+from morgs_mi.fit.first_frame import adapted_to_images, dropped
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import View
 from tests.scenes.ball import bytes_of, images_of, opaque_ball, problem
 from tests.scenes.cameras import arc, look_at_cameras

@@ -9,7 +9,7 @@ from morgs_mi import RenderConfig
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import View, mean_psnr, rendered, withheld_blocks
 from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views
 from tests.scenes.cameras import look_at_cameras

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.io.invalid import without_invalid
+from morgs_mi.io.splats import without_invalid
 from tests.scenes.changing_splats import splats
 
 N = 40

@@ -7,7 +7,7 @@ import logging
 
 import numpy as np
 
-from morgs_mi.io.model_cameras import model_cameras
+from morgs_mi.playback.default_rig import model_cameras
 
 
 def test_model_cameras__names_keys_that_it_does_not_understand_once(tmp_path, caplog):

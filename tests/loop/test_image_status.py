@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.loop.image_status import image_status
+from morgs_mi.loop.input_images import image_status
 
 H = 48
 W = 64

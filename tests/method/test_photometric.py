@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import SH_C0
+from morgs_mi.method.motion import refine_start
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.photometric import refine_start
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
@@ -81,7 +81,7 @@ def test_refine_start__keeps_true_motion(scene):
 
 def test_refine_start__takes_no_step_longer_than_the_limit(scene, monkeypatch):
     gaussians, views, _ = scene
-    monkeypatch.setattr("morgs_mi.method.photometric.LONGEST_PX", 0.1)
+    monkeypatch.setattr("morgs_mi.method.motion.LONGEST_PX", 0.1)
     step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
     px = [
         view.camera.projection_jacobian(np.asarray(gaussians.means)) @ step[..., None]

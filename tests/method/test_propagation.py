@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from morgs_mi.method.motion import propagate_motion
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras

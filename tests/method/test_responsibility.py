@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
+from morgs_mi.method.active_set import ChangedView, overlap, responsibility
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.responsibility import ChangedView, overlap, responsibility
-from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.view_group import backproject
+from morgs_mi.render.active_view import ActiveView, backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 

@@ -9,8 +9,7 @@ import pytest
 from morgs_mi.extras.calibration.offset_equations import image_gradient
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import MAPS, KeyImages
-from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.view_group import backproject
+from morgs_mi.render.active_view import ActiveView, backproject
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.active_view import ActiveView, backproject, make_active_view
 from morgs_mi.render.region import Region
-from morgs_mi.render.view_group import backproject
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_wide_camera

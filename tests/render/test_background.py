@@ -11,9 +11,8 @@ import pytest
 
 from morgs_mi import Camera, RenderConfig, StreamLoop, rasterize
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.active_view import ActiveView, ViewGroup
 from morgs_mi.render.region import Region
-from morgs_mi.render.view_group import ViewGroup
 from morgs_mi.testing import IMAGE_ABS, assert_close
 from tests.quick import NO_DENSITY, quick
 from tests.scenes.ball import opaque_ball

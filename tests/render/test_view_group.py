@@ -10,9 +10,8 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.active_view import ActiveView, ViewGroup, backproject, make_active_view
 from morgs_mi.render.region import Region
-from morgs_mi.render.view_group import ViewGroup, backproject
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_camera, make_wide_camera

@@ -9,8 +9,7 @@ import numpy as np
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.fit.initialise import from_points
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem, from_points
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import QUAD, look_at_cameras
 

@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.evaluate.reference64 import reference64
+from morgs_mi.evaluate.accuracy import reference64
 from tests import tolerances as tol
 from tests.scenes.gaussians import Values
 

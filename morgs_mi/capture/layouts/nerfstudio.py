@@ -29,12 +29,11 @@ from morgs_mi.capture.layouts.calibration import (
 )
 from morgs_mi.capture.layouts.clips import clip_of_image, size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import read_json
+from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, errors_at
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, existing_file
 from morgs_mi.io.ply import read_vertices
-from morgs_mi.io.unread import warn_unread
 
 _LOG = logging.getLogger(__name__)
 

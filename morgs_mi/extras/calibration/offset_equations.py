@@ -39,8 +39,7 @@ from scipy.spatial import KDTree
 
 from morgs_mi.core.gaussians import ActivatedGaussians, Gaussians
 from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.view_group import backproject
+from morgs_mi.render.active_view import ActiveView, backproject
 
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4

@@ -61,7 +61,7 @@ from morgs_mi.extras.calibration.offset_equations import (
 )
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.ssim import Target

@@ -37,7 +37,7 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import View
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair

@@ -30,10 +30,9 @@ from morgs_mi.capture.layouts.calibration import (
     required_clips,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import MAX_TOML, read_text, read_toml
+from morgs_mi.core.bounded import MAX_TOML, read_text, read_toml, warn_unread
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
-from morgs_mi.io.unread import warn_unread
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
 _CAMERA = {*_KEYS, "name", "size", "fisheye"}

@@ -16,10 +16,9 @@ import numpy as np
 
 from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Reader
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.bounded import read_array, read_json
+from morgs_mi.core.bounded import read_array, read_json, warn_unread
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import bounded, errors_at, numbers, require
-from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import natural_key
 
 _LOG = logging.getLogger(__name__)

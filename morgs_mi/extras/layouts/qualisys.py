@@ -33,10 +33,9 @@ from morgs_mi.capture.layouts.calibration import (
     required_clips,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import check_claim, read_bytes
+from morgs_mi.core.bounded import check_claim, read_bytes, warn_unread
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
-from morgs_mi.io.unread import warn_unread
 
 _LOG = logging.getLogger(__name__)
 

@@ -29,9 +29,8 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE
+from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE, camera_of_fields, load_json
 from morgs_mi.codec.frame_source import FrameSource
-from morgs_mi.codec.header import camera_of_fields, load_json
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import open_regular
 from morgs_mi.core.fit_names import PROVISIONAL, STREAM

@@ -14,7 +14,7 @@ from urllib.parse import urlencode, urlsplit
 import cv2
 import numpy as np
 
-from morgs_mi.codec.header import header_json
+from morgs_mi.codec.container import header_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer.server import Viewer
