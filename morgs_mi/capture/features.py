@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import positions_of
 
 # Larger images add no corners that other views also see, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
@@ -135,7 +136,7 @@ def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list
     """
     count = len(cameras)
     neighbours = count if count <= _ALL_PAIRS else _NEIGHBOURS
-    positions = np.array([camera.position for camera in cameras])
+    positions = positions_of(cameras)
     distances = np.linalg.norm(positions[:, None] - positions, axis=2)
     ranks = distances.argsort(axis=1).argsort(axis=1)
     matches = []
@@ -253,7 +254,7 @@ def intersect(
     Observation k is the pixel position `pixels[k]` of point `track[k]` in view `views[k]`.
     """
     # Poses relative to the rig's centre and size make a system of equations well conditioned.
-    positions = np.array([camera.position for camera in cameras])
+    positions = positions_of(cameras)
     middle = positions.mean(0)
     scale = np.linalg.norm(positions - middle, axis=1).max() or 1.0
     V = np.array([camera.world_to_camera[:3] for camera in cameras])
@@ -301,7 +302,7 @@ def _widest_angles(
     """Return twice the largest angle [P] between a point's rays and their mean, degrees: the spread
     of its views.
     """
-    positions = np.array([camera.position for camera in cameras])[views]
+    positions = positions_of(cameras)[views]
     with np.errstate(invalid="ignore"):
         rays = _directions(points[track] - positions)
         mean = _directions(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))

@@ -75,15 +75,13 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
         "metadata": dict(metadata),
     }
     try:
-        text = json.dumps(fields, allow_nan=False, default=_matrix_rows)
+        text = json.dumps(
+            fields, allow_nan=False, default=lambda matrix: np.asarray(matrix, np.float64).tolist()
+        )
         header_fields(text.encode())
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"StreamWriter(): a reader would refuse the header: {error}.") from None
     return text
-
-
-def _matrix_rows(matrix: Any) -> list[list[float]]:
-    return np.asarray(matrix, dtype=np.float64).tolist()
 
 
 def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:

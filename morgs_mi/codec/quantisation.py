@@ -88,7 +88,9 @@ class Grid:
 
     def steps(self, name: str) -> np.ndarray:
         """Return the steps of a group, float64 [N, 3] for `log_scales`, [N, 1] for every other."""
-        return step_sizes(self.exponents[:, _exponent_columns(self.optional)[name]])
+        names = (*_ALWAYS, *optional_names(self.optional))
+        columns = _slices({name: 3 if name == "log_scales" else 1 for name in names})
+        return step_sizes(self.exponents[:, columns[name]])
 
     def real(self, name: str) -> np.ndarray:
         """Return the numbers that the integers of a group stand for, float64 [N, its width]."""
@@ -185,12 +187,6 @@ def num_integers(degree: int, optional: int) -> int:
     """Return the number of integers of a Gaussian: largest component, E exponents, C values."""
     *_, last = columns_of(degree, optional).values()
     return 1 + num_exponents(optional) + last.stop
-
-
-def _exponent_columns(optional: int) -> dict[str, slice]:
-    return _slices(
-        {name: 3 if name == "log_scales" else 1 for name in (*_ALWAYS, *optional_names(optional))}
-    )
 
 
 def _slices(widths: Mapping[str, int]) -> dict[str, slice]:

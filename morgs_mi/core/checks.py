@@ -120,6 +120,11 @@ def check_mask(place: str, mask: Any, height: int, width: int) -> None:
     )
 
 
+def valid_pixels(mask: np.ndarray | None, shape: Sequence[int]) -> np.ndarray:
+    """Return a mask [H, W] of valid pixels, all of an image of a shape [H, W, ...] for None."""
+    return np.ones(shape[:2], bool) if mask is None else mask
+
+
 def few(names: Sequence[Any] | np.ndarray, most: int = 10) -> str:
     """Return the first of some names in words."""
     rest = len(names) - most

@@ -33,16 +33,16 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
     It is 1 for a single camera.
     """
-    radius = _central_distances(_positions(cameras)).max()
+    radius = central_distances(positions_of(cameras)).max()
     return float(1.1 * radius) if radius > 0 else 1.0
 
 
-def _positions(cameras: Sequence[Camera]) -> np.ndarray:
+def positions_of(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the positions of the cameras [V, 3]."""
     return np.array([camera.position for camera in cameras])
 
 
-def _central_distances(positions: np.ndarray) -> np.ndarray:
+def central_distances(positions: np.ndarray) -> np.ndarray:
     """Return the distance of each of the positions [V, 3] from their mean [V]."""
     return np.linalg.norm(positions - positions.mean(0), axis=1)
 
@@ -51,7 +51,7 @@ def far_origin(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the median position [3] of cameras that are too far from 0 for float32, rounded to the
     power of ten below ten times their mean distance from it; zeros if they are not.
     """
-    positions = _positions(cameras)
+    positions = positions_of(cameras)
     middle = np.median(positions, axis=0)
     distance = np.linalg.norm(middle)
     size = max(np.linalg.norm(positions - middle, axis=1).mean() or 1.0, 1e-9 * distance)
@@ -170,7 +170,7 @@ def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
     """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
     0 if unknown.
     """
-    positions = _positions(cameras)
+    positions = positions_of(cameras)
     focus = focus_depths(cameras)
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
@@ -188,8 +188,8 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     """
     if not cameras:
         return ()
-    positions = _positions(cameras)
-    views = [int(np.argmin(_central_distances(positions)))]
+    positions = positions_of(cameras)
+    views = [int(np.argmin(central_distances(positions)))]
     while len(views) < min(count, len(cameras)):
         distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
         views.append(int(np.argmax(distance)))

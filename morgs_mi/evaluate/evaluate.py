@@ -4,7 +4,7 @@ list of measures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.progress import Steps
 from morgs_mi.evaluate.comparison import ComparedClip
 from morgs_mi.evaluate.measures import (
     ImageDistance,
@@ -33,7 +34,7 @@ _UNKNOWN = (None, 0, ())  # Of a frame without a report.
 def evaluate_stream(
     out: str | Path,
     capture: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Steps | None = None,
     lpips: ImageDistance | None = None,
     any_recording: bool = False,
 ) -> Evaluation:
@@ -82,6 +83,7 @@ def evaluate_stream(
         if progress is not None:
             progress(len(rows), len(clip.packets))
     num_fitted = len(recording.train_views)
+    num_bytes = stream.path.stat().st_size
     return Evaluation(
         stream=str(stream.path.resolve()),
         capture=str(recording.path.resolve()),
@@ -93,7 +95,15 @@ def evaluate_stream(
             if np.isnan(row.scores.psnr) or fitted.get(row.frame, _UNKNOWN)[1] == num_fitted
         ),
         regions="recorded change" if recording.truth is None else "true masks",
-        sizes=_sizes(stream.path.stat().st_size, rows),
+        sizes=Sizes(
+            num_bytes,
+            num_bytes - sum(row.num_bytes for row in rows),
+            num_bytes / len(rows),
+            *(
+                known_mean([row.num_bytes for row in rows if row.kind == kind])
+                for kind in ("keyframe", "residual")
+            ),
+        ),
         frames=tuple(rows),
         **_merged(measure.result() for measure in measures),
     )
@@ -102,16 +112,6 @@ def evaluate_stream(
 def _merged(fields: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """Return the fields of several measures together."""
     return {name: value for each in fields for name, value in each.items()}
-
-
-def _sizes(num_bytes: int, rows: list[FrameScores]) -> Sizes:
-    """Return the sizes of a stream file of `num_bytes`."""
-
-    def mean(kind: str) -> float:
-        return known_mean([row.num_bytes for row in rows if row.kind == kind])
-
-    overhead = num_bytes - sum(row.num_bytes for row in rows)
-    return Sizes(num_bytes, overhead, num_bytes / len(rows), mean("keyframe"), mean("residual"))
 
 
 def _fitted(stream: Path) -> dict[int, tuple[float | None, int, Sequence[str]]]:

@@ -16,9 +16,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
+from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.metrics import (
@@ -85,7 +86,17 @@ class Quality(Measure):
         scores = _image_scores(view, self._lpips)
         # A keyframe has no motion.
         if view.frame.kind == PacketKind.RESIDUAL and view.truth is not None:
-            scores |= _motion_scores(view.maps, view.truth)
+            motion = view.maps["motion"]
+            true = view.truth.motion
+            mask = view.truth.mask
+            scores |= {
+                "motion_error": endpoint_error(motion, true),
+                "motion_error_moving": endpoint_error(motion, true, mask),
+                "motion_error_still": endpoint_error(motion, true, ~mask),
+                "true_motion_moving": endpoint_error(np.zeros_like(motion), true, mask),
+            }
+            if "confidence" in view.maps:
+                scores["confidence_iou"] = iou(view.maps["confidence"][..., 0] > 0.5, mask)
         self._views[view.camera.name] = ViewScores(**scores)
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
@@ -165,7 +176,10 @@ class Speed(Measure):
 def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
     """Return the scores of a rendered image by metric and region."""
     rendered = view.rendered
-    regions = _regions(view, rendered.shape[:2])
+    whole = valid_pixels(view.valid, rendered.shape)
+    moving = np.zeros_like(whole) if view.moving is None else whole & view.moving
+    still = np.zeros_like(whole) if view.moving is None else whole & ~moving
+    regions = dict(zip(REGIONS, (whole, moving, still), strict=True))
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
     exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
     scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), regions[""]))}
@@ -183,35 +197,8 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
     return scores
 
 
-def _regions(view: ComparedView, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """Return the masks [H, W] of `REGIONS`."""
-    whole = np.ones(shape, bool) if view.valid is None else view.valid
-    if view.moving is None:
-        moving = still = np.zeros_like(whole)
-    else:
-        moving = whole & view.moving
-        still = whole & ~view.moving
-    return dict(zip(REGIONS, (whole, moving, still), strict=True))
-
-
 def _by_region(
     name: str, values: np.ndarray, regions: Mapping[str, np.ndarray | None]
 ) -> dict[str, float]:
     """Return the mean of a map over each region, which is all of it for None."""
     return {name + region: mean_over(values, mask) for region, mask in regions.items()}
-
-
-def _motion_scores(maps: Mapping[str, np.ndarray], truth: GroundTruth) -> dict[str, float]:
-    """Return the errors of the rendered motion and confidence."""
-    motion = maps["motion"]
-    true = truth.motion
-    moving = truth.mask
-    scores = {
-        "motion_error": endpoint_error(motion, true),
-        "motion_error_moving": endpoint_error(motion, true, moving),
-        "motion_error_still": endpoint_error(motion, true, ~moving),
-        "true_motion_moving": endpoint_error(np.zeros_like(motion), true, moving),
-    }
-    if "confidence" in maps:
-        scores["confidence_iou"] = iou(maps["confidence"][..., 0] > 0.5, moving)
-    return scores

@@ -125,16 +125,12 @@ def rigid_motions(
         target = q.mean(0)
         size = np.linalg.norm(p - center, axis=-1).max()
         spread = np.linalg.svd((q - target).T @ (p - center) / len(p), compute_uv=False)
-        rotation = _rotation(p - center, q - target)
+        # The rotation that maps p best to q, both around their means.
+        U, _, Vt = np.linalg.svd((q - target).T @ (p - center))
+        U[:, 2] *= np.linalg.det(U @ Vt)
+        rotation = U @ Vt
         shift = target - rotation @ center
         off = np.linalg.norm(p @ rotation.T + shift - q, axis=-1).max()
         if spread[1] > (_FLAT * size) ** 2 and off <= _RIGID * size:
             motions[int(index)] = (rotation, shift)
     return motions
-
-
-def _rotation(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the rotation [3, 3] that best maps points p to q [P, 3], both around their means."""
-    U, _, Vt = np.linalg.svd(q.T @ p)
-    U[:, 2] *= np.linalg.det(U @ Vt)
-    return U @ Vt

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.evaluate.metrics import mean_over, unit_pair
 from morgs_mi.evaluate.results import VariationScores
 
@@ -61,7 +62,7 @@ class StillVariation:
         """
         if self._frames < 2:
             return VariationScores()
-        valid = np.ones(self._motion_counts.shape, bool) if self._valid is None else self._valid
+        valid = valid_pixels(self._valid, self._motion_counts.shape)
         still = (self._motion_counts <= self._false_alarms * self._frames) & valid
         render, recorded = (
             100 * mean_over(total, still) / (self._frames - 1) for total in self._sums

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import unit_values
 
 # A value of a block follows from its mean and the other three.
@@ -46,7 +47,7 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
         mask: valid pixels [H, W], or None; a block with others has no detail.
     """
     values = unit_values(image, np.float32)
-    valid = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+    valid = valid_pixels(mask, image.shape).astype(np.float32)
     noise = _NOISE * noise_of(image)
     count = 0
     while min(values.shape[:2]) > 1:

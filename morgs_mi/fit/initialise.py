@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, in_image, scene_depths, scene_extent, seen_points
@@ -195,7 +196,7 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
     for (view, depth), share in zip(pairs, shares, strict=False):
         camera, image, mask = view
         distance = max(depth, 10 * camera.near)
-        rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
+        rows, columns = np.nonzero(valid_pixels(mask, image.shape))
         pixels = rng.integers(0, len(rows), len(share))
         rows = rows[pixels]
         columns = columns[pixels]

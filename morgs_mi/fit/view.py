@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.render.rasterize import rasterize
@@ -79,7 +80,7 @@ def withheld_blocks(
         rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
         blocks = rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE
         is_withheld = blocks[rows][:, columns]
-        valid = np.ones_like(is_withheld) if mask is None else mask
+        valid = valid_pixels(mask, is_withheld.shape)
         visible.append(View(camera, image, valid & ~is_withheld))
         withheld.append(View(camera, image, valid & is_withheld))
     return visible, withheld

@@ -131,7 +131,12 @@ class VideoReader(_Frames):
             width, height = (first.width, first.height)[:: 1 if is_upright else -1]
             fps = float(stream.guessed_rate or 0)
             shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
-            stamps = _stamps(shown, first)
+            # Without stamps, if a packet has none, or two have the same.
+            stamps = None
+            present = {time for time in shown if time is not None}
+            if first.pts is not None and len(present) == len(shown):
+                held = [time for time in present if time >= first.pts]
+                stamps = np.array(sorted(held), np.int64)
             num_held = len(shown if stamps is None else stamps)
             num_frames = stream.frames - hidden if stream.frames else 0
             if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
@@ -177,7 +182,14 @@ class VideoReader(_Frames):
                     last = index
                     index, frame = next(numbered, (maxsize, None))
                 if frame is None or index > target:
-                    yield self._missing(last + 1 if frame is None else target)
+                    missing = last + 1 if frame is None else target
+                    yield ValueError(
+                        f"{self.path}: it has ended after {self.num_frames} frames; record longer."
+                        if missing >= self.num_frames
+                        else f"{self.path}: frame {missing} of {self.num_frames} cannot be "
+                        "decoded: the file is truncated or broken; copy it again or use the first "
+                        f"{missing} frames (`max_frames`)."
+                    )
                     continue
                 # Of 10 bits, BGR has half the error of RGB. Starting threads takes 1 ms a frame.
                 bgr = converter.reformat(
@@ -215,16 +227,6 @@ class VideoReader(_Frames):
                     yield from numbered
                     return
 
-    def _missing(self, index: int) -> ValueError:
-        if index >= self.num_frames:
-            return ValueError(
-                f"{self.path}: it has ended after {self.num_frames} frames; record longer."
-            )
-        return ValueError(
-            f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is "
-            f"truncated or broken; copy it again or use the first {index} frames (`max_frames`)."
-        )
-
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
@@ -251,16 +253,6 @@ def _unbroken(read: Callable[[], Iterable[_Item]]) -> Iterator[_Item]:
 
     with suppress(FFmpegError):
         yield from read()
-
-
-def _stamps(times: list[int | None], first: av.VideoFrame) -> np.ndarray | None:
-    """Return the ascending times of packets from the first frame that is shown; None if a packet
-    has none, or two have the same.
-    """
-    present = [time for time in times if time is not None]
-    if first.pts is None or len({*present}) < len(times):
-        return None
-    return np.array(sorted(time for time in present if time >= first.pts), np.int64)
 
 
 def _length(

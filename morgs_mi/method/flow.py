@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow_sources.flow_registry import (
@@ -77,7 +78,7 @@ def _checked_flow(
 ) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
     backward, forward = source(pair)
-    valid = np.ones(backward.shape[:2], bool) if pair.valid is None else pair.valid
+    valid = valid_pixels(pair.valid, backward.shape)
     within = valid
     if pair.box is not None:
         within = np.zeros_like(valid)

@@ -16,7 +16,7 @@ from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.fit_names import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
-from morgs_mi.io.listing import listed
+from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig, trained_cameras
 from morgs_mi.playback.export.web import stream_html
@@ -104,8 +104,7 @@ def stream_path(out: str | Path) -> Path:
                 f"one, such as {path / frames[0]}, or run `morgs-mi import`."
             )
     path = path / STREAM if path.is_dir() else path
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a stream, found none; fit a capture first.")
+    existing_file(path, "a stream", "fit a capture first")
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
     if start != MAGIC:

@@ -97,14 +97,6 @@ def confidence_image(confidence: np.ndarray) -> np.ndarray:
     return _apply_colour_map(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
 
 
-def _write(
-    image: np.ndarray, text: str, origin: tuple[int, int], scale: float, grey: int, width: int = 1
-) -> None:
-    """Draw text into an image, with its lower left corner at `origin`."""
-    color = (grey, grey, grey)
-    cv2.putText(image, text, origin, _FONT, scale, color, width, cv2.LINE_AA)
-
-
 def depth_image(depth: np.ndarray) -> np.ndarray:
     """Return depth [H, W] or [H, W, 1] in world units as colours, linear in 1 / depth: red is the
     1st percentile and nearer, blue the 99th and farther.
@@ -131,7 +123,8 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
     thickness = 2 if scale > 0.8 else 1
     (width, height), base = cv2.getTextSize(text, _FONT, scale, thickness)
     image[: height + base + 4, : width + 8] //= 4
-    _write(image, text, (4, height + 3), scale, 255, thickness)
+    white = (255, 255, 255)
+    cv2.putText(image, text, (4, height + 3), _FONT, scale, white, thickness, cv2.LINE_AA)
     return image
 
 

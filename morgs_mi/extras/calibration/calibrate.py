@@ -37,14 +37,14 @@ from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import few, require
+from morgs_mi.core.checks import few, require, valid_pixels
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.progress import Report
 from morgs_mi.extras.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck
-from morgs_mi.io.video import Clip, open_clips
+from morgs_mi.io.video import open_clips
 
 Mapper = Literal["incremental", "global"]
 
@@ -299,8 +299,17 @@ def _frames(
     """Return one image per camera by its name, and the masks of opaque pixels of images with
     transparent ones.
     """
-    clips = _clips(path, without)
-    readers = dict(zip(clips, open_clips([*clips.values()]), strict=True))
+    clips = find_clips(path)
+    names = names_without(path, clips, without)
+    requirement = "expected names without line feeds, as COLMAP has one image a line"
+    broken = [name for name in names if "\n" in name]
+    require(not broken, str(path), requirement, repr(few(broken)), "rename it")
+    if len(names) < 2:
+        raise ValueError(
+            f"{path}: expected the clips of at least two cameras, found "
+            f"{', '.join(names) or 'none'}; check the path, or make {EXAMPLE}"
+        )
+    readers = dict(zip(names, open_clips([clips[name] for name in names]), strict=True))
     # The last timestamp of each clip, in frames of a constant rate.
     last_frames = {
         name: reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
@@ -319,21 +328,6 @@ def _frames(
     images = {name: display_image(image, stops) for name, image in frames.items()}
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
     return images, {name: mask for name, mask in masks.items() if mask is not None}
-
-
-def _clips(path: Path, without: Sequence[str]) -> dict[str, Clip]:
-    """Return the files of at least two cameras by name, except of those to leave out."""
-    clips = find_clips(path)
-    names = names_without(path, clips, without)
-    requirement = "expected names without line feeds, as COLMAP has one image a line"
-    broken = [name for name in names if "\n" in name]
-    require(not broken, str(path), requirement, repr(few(broken)), "rename it")
-    if len(names) < 2:
-        raise ValueError(
-            f"{path}: expected the clips of at least two cameras, found "
-            f"{', '.join(names) or 'none'}; check the path, or make {EXAMPLE}"
-        )
-    return {name: clips[name] for name in names}
 
 
 def match_views(
@@ -368,7 +362,7 @@ def match_views(
     if masks:
         (scratch / _MASKS).mkdir()
         for name, image in images.items():  # COLMAP needs a mask for every image
-            opaque = masks.get(name, np.ones(image.shape[:2], bool))
+            opaque = valid_pixels(masks.get(name), image.shape)
             _write_png(scratch / _MASKS / f"{name}.png.png", 255 * opaque.astype(np.uint8))
         reader.mask_path = scratch / _MASKS
     pycolmap.set_random_seed(config.seed)

@@ -19,7 +19,6 @@ frame. The errors of the offsets are divided by the part of this move that the e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -31,7 +30,6 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
@@ -240,18 +238,7 @@ class _Clips:
         images = self.at(times)
         next_images = self.at(times + 1)
         pairs = {v: FramePair(next_images[v], images[v], valid=self.masks[v]) for v in self.train}
-        gaussians = self._fitted(images, 2 if blur else 1)
-        views = [ActiveView(camera) for camera in self.cameras]
-        flow = lift_flow(gaussians, {v: views[v] for v in self.train}, observe_key_views(pairs))
-        gaussians = replace(gaussians, motion=flow.displacement)
-        targets = list(map(Target, images, self.masks))
-        train = np.isin(np.arange(len(views)), self.train)
-        return offset_equations(gaussians, views, targets, train, blur)
-
-    def _fitted(self, images: Sequence[np.ndarray], divisor: int) -> Gaussians:
-        """Return Gaussians fitted to the images [V] of the training views at one timestamp, by the
-        numbers of Gaussians and steps over `divisor`.
-        """
+        divisor = 2 if blur else 1
         fit = FitConfig(
             sh_degree=0,
             num_gaussians=GAUSSIANS // divisor,
@@ -259,8 +246,14 @@ class _Clips:
             dropout=0.0,
             density=DensityConfig(rounds=0),
         )
-        views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
+        fit_views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
         rng = rng_of(0, Stream.TIMING)
         points = (self.capture.points, self.capture.point_colors)
-        problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
-        return fit_first_frame(problem, fit, rng).gaussians
+        problem = FirstFrameProblem.of(fit_views, points, fit, RenderConfig(), rng)
+        gaussians = fit_first_frame(problem, fit, rng).gaussians
+        views = [ActiveView(camera) for camera in self.cameras]
+        flow = lift_flow(gaussians, {v: views[v] for v in self.train}, observe_key_views(pairs))
+        gaussians = replace(gaussians, motion=flow.displacement)
+        targets = list(map(Target, images, self.masks))
+        train = np.isin(np.arange(len(views)), self.train)
+        return offset_equations(gaussians, views, targets, train, blur)

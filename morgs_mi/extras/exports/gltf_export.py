@@ -153,8 +153,7 @@ def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
     first one's right.
     """
     up = up_direction(cameras)
-    views = cameras[0].world_to_camera
-    right, forward = (side - (side @ up) * up for side in (views[0, :3], views[2, :3]))
+    right, _, forward = (side - (side @ up) * up for side in cameras[0].rotation)
     if np.linalg.norm(right) < 0.5:  # the camera is rolled by 90 degrees: its right is nearly up
         right = forward
     right /= np.linalg.norm(right)

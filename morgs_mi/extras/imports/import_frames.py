@@ -220,22 +220,12 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     survivors = _increasing(nearest)
     if len(survivors) < _LEAST_SURVIVORS * fewer:
         return None
-    return _rows_with_gaps(survivors, nearest[survivors], len(now), len(before))
-
-
-def _rows_with_gaps(
-    survivors: np.ndarray, rows_before: np.ndarray, count: int, count_before: int
-) -> np.ndarray:
-    """Return the row in the frame before of all `count` Gaussians [M]; -1 for births.
-
-    Between two survivors with as many rows between them in both frames, those are the same ones,
-    too; the others are births.
-    """
-    rows = np.full(count, -1)
-    rows[survivors] = rows_before
-    ends = np.concatenate(
-        [[[-1, -1]], np.stack([survivors, rows_before], axis=1), [[count, count_before]]]
-    )
+    # Between two survivors with as many rows between them in both frames, those are the same ones,
+    # too; the others are births.
+    rows = np.full(len(now), -1)
+    rows[survivors] = nearest[survivors]
+    pairs = np.stack([survivors, nearest[survivors]], axis=1)
+    ends = np.concatenate([[[-1, -1]], pairs, [[len(now), len(before)]]])
     gap, gap_before = np.diff(ends, axis=0).T
     for k in np.flatnonzero((gap == gap_before) & (gap > 1)):
         row, row_before = ends[k] + 1

@@ -181,9 +181,8 @@ def render_inserted(
             entries = build(frame, frame / stream.fps)
             images = _render(gaussians, view, entries, channels, config)
             if view.height != camera.height:
-                size = camera.size
                 for name, image in images.items():
-                    values = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+                    values = cv2.resize(image, camera.size, interpolation=cv2.INTER_LINEAR)
                     images[name] = values.reshape(camera.height, camera.width, -1)
                 if "motion" in images:  # in pixels
                     images["motion"] *= np.array([1, camera.height / view.height], np.float32)

@@ -12,6 +12,7 @@ import numpy as np
 
 from morgs_mi.core.checks import kind_of, require
 from morgs_mi.core.color_space import unit_values
+from morgs_mi.io.listing import existing_file
 
 # Mean and standard deviation of ImageNet's colours, by which most networks for images normalise
 # their input.
@@ -46,9 +47,7 @@ class OnnxNetwork:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        if not self.path.is_file():
-            raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
+        self.path = existing_file(path, "an ONNX file")
         try:
             import onnxruntime
         except ImportError:

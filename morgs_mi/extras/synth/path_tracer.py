@@ -13,6 +13,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import encode_light
+from morgs_mi.core.rig import in_image
 from morgs_mi.extras.synth.disturbances import undistorted
 from morgs_mi.extras.synth.ground_truth import SurfacePoints
 from morgs_mi.extras.synth.scene import Pose, Scene
@@ -201,5 +202,4 @@ class PathTracer:
         ray.maxt = mi.Float((1 - _OWN_SURFACE) * distance)
         is_free = ~np.array(self._scene.ray_test(ray))
         pixels, depth = camera.project(points)
-        mask = np.all((pixels >= 0) & (pixels < camera.size), axis=-1)
-        return is_free & (depth > camera.near) & mask
+        return is_free & (depth > camera.near) & in_image(camera, pixels)

@@ -197,7 +197,15 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
             require(not twice, where, requirement, f"{sorted(twice)} twice", "rename one")
             names.update(ids)
             for time in times if item.pose is not None else ():
-                _check_pose(where, item.pose, time)
+                pose_place = f"{where}: its pose at {time:.4g} s"
+                try:
+                    matrix = np.reshape(item.pose(time), (4, 4))
+                except Exception as error:
+                    reason = f"{type(error).__name__}: {error}".rstrip(".")
+                    raise ValueError(
+                        f"{pose_place} fails with {reason}; correct the function."
+                    ) from error
+                rigid(f"{pose_place} is not rigid", matrix)
 
 
 def _check_values(where: str, node: Mapping[str, Any]) -> None:
@@ -206,16 +214,6 @@ def _check_values(where: str, node: Mapping[str, Any]) -> None:
         require(value is not None, where, f"`{key}` must have a value", "None", "leave it out")
         if isinstance(value, Mapping):
             _check_values(f"{where}, {key}", value)
-
-
-def _check_pose(where: str, pose: Any, time: float) -> None:
-    where = f"{where}: its pose at {time:.4g} s"
-    try:
-        matrix = np.reshape(pose(time), (4, 4))
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}".rstrip(".")
-        raise ValueError(f"{where} fails with {reason}; correct the function.") from error
-    rigid(f"{where} is not rigid", matrix)
 
 
 def translate(x: float, y: float, z: float) -> np.ndarray:

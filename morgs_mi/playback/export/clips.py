@@ -14,6 +14,7 @@ from morgs_mi.codec.frame_source import FrameSource, FrameState, play
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Steps
 from morgs_mi.core.rig import moved
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
@@ -23,7 +24,6 @@ from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, 
 from morgs_mi.playback.player import available_channels, render
 from morgs_mi.playback.stream_header import render_config, stream_origin
 
-Progress = Callable[[int, int], None] | None
 # Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be
 # tilted.
 _SWING = 60.0
@@ -122,7 +122,7 @@ def write_ply_files(
     output: str | Path,
     kind: Format,
     frames: Sequence[int],
-    progress: Progress = None,
+    progress: Steps | None = None,
 ) -> None:
     """Write frames of a stream as PLY files of a format in `PLY`, see `write_each`."""
     is_compressed = kind.name == "compressed.ply"
@@ -137,7 +137,7 @@ def write_each(
     suffix: str,
     write: Callable[[Path, Gaussians], None],
     frames: Sequence[int],
-    progress: Progress = None,
+    progress: Steps | None = None,
 ) -> None:
     """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file;
     atomically.

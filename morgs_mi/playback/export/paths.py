@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, intrinsics_of_fov, rigid
 from morgs_mi.core.checks import check_number
-from morgs_mi.core.rig import up_direction
+from morgs_mi.core.rig import positions_of, up_direction
+from morgs_mi.io.listing import existing_file
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -114,7 +115,7 @@ def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     """
     weight = _MEDIAN_WEIGHT * len(cameras)
     axes = np.array([camera.rotation[2] for camera in cameras])
-    positions = np.array([camera.position for camera in cameras])
+    positions = positions_of(cameras)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     A = weight * np.eye(3) + across.sum(axis=0)
     b = weight * np.median(means, axis=0) + np.einsum("nij,nj->i", across, positions)
@@ -187,9 +188,7 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
         FileNotFoundError: there is no such file.
         ValueError: the file is not JSON, or a key is not as described.
     """
-    if not Path(file).is_file():
-        raise FileNotFoundError(f"{file}: expected a camera path, found none; check the path.")
-    document = read_json(file)
+    document = read_json(existing_file(file, "a camera path"))
     place = str(file)
     try:
         views = []

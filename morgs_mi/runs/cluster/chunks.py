@@ -161,11 +161,30 @@ class ChunkedRun:
             folder.mkdir(exist_ok=True)
             with ExitStack() as self.open_files:
                 self._fit_side_by_side(self._begun(Progress(self.on_stage)))
-            return self._joined()
+            packets = (
+                packet
+                for start in self.starts[:-1]
+                for packet in StreamReader(self._files(start).stream)
+            )
+            recordings = [self.recordings[start] for start in self.starts[:-1]]
+            reports = [report for recording in recordings for report in recording.reports]
+            workers = {"workers": self.peaks} if len(recordings) > 1 else {}
+            with Recording(FitFiles.of(self.out), self.capture, self.metadata) as recording:
+                recording.extend(packets, reports, **workers)
+            _remove(folder)
+            return reports
 
     def _begun(self, progress: Progress) -> list[Chunk]:
         """Return the chunks after the common model, which is fitted if it is missing."""
-        chunks = [self._earlier(start, stop) for start, stop in pairwise(self.starts)]
+        chunks = []
+        for start, stop in pairwise(self.starts):
+            chunk = Chunk(start, stop, start)
+            earlier = interrupted_fit(self._files(start), self.capture, self.metadata, start)
+            if earlier is not None:
+                self._open(start, earlier)
+                frame = start + len(earlier.reports)
+                chunk = replace(chunk, frame=frame, restart=earlier.restart)
+            chunks.append(chunk)
         first = chunks[0]
         stop = min(COMMON_FRAMES, first.stop)
         prepared = None
@@ -230,14 +249,6 @@ class ChunkedRun:
         """Return stream and report of the chunk that begins with a frame."""
         return FitFiles(self.out / FOLDER / f"{start}.morgs", self.out / FOLDER / f"{start}.json")
 
-    def _earlier(self, start: int, stop: int) -> Chunk:
-        """Return a chunk as an interrupted fit left it."""
-        earlier = interrupted_fit(self._files(start), self.capture, self.metadata, start)
-        if earlier is None:
-            return Chunk(start, stop, start)
-        self._open(start, earlier)
-        return Chunk(start, stop, start + len(earlier.reports), earlier.restart)
-
     def _open(self, start: int, earlier: Interrupted | None) -> None:
         """Open the files of a chunk."""
         recording = Recording(self._files(start), self.capture, self.metadata, earlier)
@@ -270,14 +281,3 @@ class ChunkedRun:
         if not stream.closed() or stream.index()[-1][1] != frames - 1:
             return None
         return read_reports(self.out / REPORT, range(frames))
-
-    def _joined(self) -> list[FrameReport]:
-        """Join the chunks into one stream with its report."""
-        starts = self.starts[:-1]
-        packets = (packet for start in starts for packet in StreamReader(self._files(start).stream))
-        reports = [report for start in starts for report in self.recordings[start].reports]
-        workers = {"workers": self.peaks} if len(starts) > 1 else {}
-        with Recording(FitFiles.of(self.out), self.capture, self.metadata) as recording:
-            recording.extend(packets, reports, **workers)
-        _remove(self.out / FOLDER)
-        return reports

@@ -108,23 +108,16 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             raise ConnectionError(
                 f"{scheduler}: expected a scheduler with workers, got {problem}; start it first."
             ) from None
-        with _in_sentences(scheduler or "this machine"):
+        try:
             yield client
-
-
-@contextmanager
-def _in_sentences(place: str) -> Iterator[None]:
-    """Raise the errors of Dask as sentences about workers at a place."""
-    try:
-        yield
-    except (Exception, CancelledError) as error:
-        name = type(error).__name__
-        if isinstance(error, RuntimeError) and "deserialization" in str(error):
-            name = "deserialization"
-        if name not in _FAULTS:
-            raise
-        kind, fault = _FAULTS[name]
-        raise kind(f"{place}: expected {fault}.") from None
+        except (Exception, CancelledError) as error:
+            name = type(error).__name__
+            if isinstance(error, RuntimeError) and "deserialization" in str(error):
+                name = "deserialization"
+            if name not in _FAULTS:
+                raise
+            kind, fault = _FAULTS[name]
+            raise kind(f"{scheduler or 'this machine'}: expected {fault}.") from None
 
 
 def num_workers(client: Client) -> int:
@@ -171,25 +164,19 @@ def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[li
                 f"client, got {version}; install the same versions on both."
             )
     messages: list[str] = []
-    with _BUSY, _logged(messages):
-        if mi.variant() != variant:
-            mi.set_variant(variant)
-        worker = _worker()
-        threads = usable_cores() if worker is None else worker.state.nthreads
-        if dr.thread_count() != threads:
-            dr.set_thread_count(threads)
-            cv2.setNumThreads(threads)
-        yield messages
-
-
-@contextmanager
-def _logged(messages: list[str]) -> Iterator[None]:
-    """Collect the warnings of the package."""
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: messages.append(record.getMessage())
     log = logging.getLogger("morgs_mi")
-    log.addHandler(handler)
-    try:
-        yield
-    finally:
-        log.removeHandler(handler)
+    with _BUSY:
+        log.addHandler(handler)
+        try:
+            if mi.variant() != variant:
+                mi.set_variant(variant)
+            worker = _worker()
+            threads = usable_cores() if worker is None else worker.state.nthreads
+            if dr.thread_count() != threads:
+                dr.set_thread_count(threads)
+                cv2.setNumThreads(threads)
+            yield messages
+        finally:
+            log.removeHandler(handler)

@@ -17,6 +17,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts import poses_bounds, reader_registry
 from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import central_distances, positions_of
 
 # A camera or the cameras of a rig.
 T = TypeVar("T")
@@ -60,9 +61,9 @@ _LEAST_FACTOR = 0.1
 
 def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Return the pairs of cameras with the same pose."""
-    positions = np.array([camera.position for camera in cameras])
+    positions = positions_of(cameras)
     rotations = np.array([camera.rotation for camera in cameras])
-    near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    near = _SAME * central_distances(positions).max()
     same = np.linalg.norm(positions[:, None] - positions, axis=-1) <= near
     same &= np.abs(rotations[:, None] - rotations).max(axis=(2, 3)) < _SAME
     return [(i, j) for i, j in np.argwhere(np.triu(same, 1)).tolist()]

@@ -12,7 +12,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.plots import check_plot, save_plot
-from morgs_mi.core.rig import up_direction
+from morgs_mi.core.rig import central_distances, positions_of, up_direction
 
 # Inches.
 _WIDTH = 14.4
@@ -71,9 +71,9 @@ def draw_rig(
         test_views: indices of the held-out cameras, drawn in red.
     """
     right, forward, up = _directions(cameras)
-    positions = np.array([camera.position for camera in cameras])
+    positions = positions_of(cameras)
     middle = positions.mean(0)
-    radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    radius = central_distances(positions).max() or 1.0
     # The centre of each camera, and the corners of its image at a depth.
     frusta = []
     for camera in cameras:

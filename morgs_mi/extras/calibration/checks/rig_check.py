@@ -131,8 +131,7 @@ def pose_problems(views: Sequence[View]) -> list[str]:
     for index, view in enumerate(views):
         # Large errors, such as another order of the cameras, show in small images.
         camera = view.camera.with_width(min(_WIDTH, view.camera.width))
-        size = camera.size
-        image = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+        image = cv2.resize(view.image, camera.size, interpolation=cv2.INTER_AREA)
         features.append(detect(image, view.mask))
         cameras.append(replace(camera, name=camera.name or f"view {index}"))
     none = np.zeros((0, 3))
