@@ -7,7 +7,6 @@ the number of Gaussians, K = (degree + 1)^2 the number of spherical harmonics (S
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Protocol
 
@@ -25,7 +24,7 @@ from morgs_mi.core.attributes import (
 )
 from morgs_mi.core.checks import numbers, require
 from morgs_mi.core.memory import float_tensor
-from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.core.types import Float, Tensor, Tensors, UInt32
 
 
 class ActivatedGaussians(Protocol):
@@ -257,7 +256,7 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 3."""
         return round(int(self.sh_coeffs.shape[1]) ** 0.5) - 1
 
-    def parameters(self) -> dict[str, Tensor]:
+    def parameters(self) -> Tensors:
         """Return the raw attributes that are present, by the names of the attribute table (SH in
         two parts).
         """
@@ -266,7 +265,7 @@ class Gaussians:
         return {a.name: values[a.name] for a in ATTRIBUTES if values.get(a.name) is not None}
 
     @classmethod
-    def from_parameters(cls, parameters: Mapping[str, Tensor]) -> Gaussians:
+    def from_parameters(cls, parameters: Tensors) -> Gaussians:
         """Return Gaussians with `parameters`, such as those of an optimiser; other names are left
         out. Gradients reach them.
 
@@ -285,7 +284,7 @@ class Gaussians:
         )
         return cls(**_raw_attributes({n: parameters[n] for n in names if n in parameters}))
 
-    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
+    def with_parameters(self, parameters: Tensors) -> Gaussians:
         """Return these Gaussians with some of their `parameters` replaced.
 
         Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree
@@ -293,7 +292,7 @@ class Gaussians:
         """
         return replace(self, **_raw_attributes(parameters))
 
-    def items(self) -> dict[str, Tensor]:
+    def items(self) -> Tensors:
         """Return the raw attributes that are present, by the names of the fields."""
         return {
             f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
@@ -351,7 +350,7 @@ def split_sh(sh_coeffs: Tensor) -> tuple[Tensor, Tensor | None]:
     return (sh_coeffs, None) if K == 1 else (sh_coeffs[:, :1], sh_coeffs[:, 1:])
 
 
-def _raw_attributes(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _raw_attributes(parameters: Tensors) -> Tensors:
     """Return parameters with the spherical harmonics in one part, where they are given."""
     values = dict(parameters)
     if "sh_dc" in values:

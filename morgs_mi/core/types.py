@@ -6,6 +6,7 @@ be checked statically: the names describe arguments and results.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 Float: TypeAlias = Any
@@ -20,3 +21,5 @@ Tensor: TypeAlias = Any
 """`mi.TensorXf`, a differentiable float32 tensor."""
 Jit: TypeAlias = Any
 """Any Dr.Jit array, or nested vectors, tuples and lists of them."""
+Tensors: TypeAlias = Mapping[str, Tensor]
+"""Tensors by name, such as parameters, losses or channels."""

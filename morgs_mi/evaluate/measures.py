@@ -179,7 +179,7 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
     whole = valid_pixels(view.valid, rendered.shape)
     moving = np.zeros_like(whole) if view.moving is None else whole & view.moving
     still = np.zeros_like(whole) if view.moving is None else whole & ~moving
-    regions = dict(zip(REGIONS, (whole, moving, still), strict=True))
+    regions = {"": whole, "_moving": moving, "_still": still}
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
     exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
     scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), regions[""]))}

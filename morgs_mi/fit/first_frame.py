@@ -28,7 +28,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
-from morgs_mi.core.types import Tensor
+from morgs_mi.core.types import Tensors
 from morgs_mi.fit.density import DensityControl
 from morgs_mi.fit.detail import is_noisy
 from morgs_mi.fit.fit_config import FitConfig
@@ -154,7 +154,7 @@ def fit_first_frame(
     views = [ActiveView(view.camera, problem.render) for view in fit_views]
     targets = [Target(view.image, view.mask) for view in fit_views]
 
-    def losses_at(parameters: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+    def losses_at(parameters: Tensors, view: int) -> Tensors:
         gaussians = dropped(start.with_parameters(parameters), config.dropout or 0.0, rng)
         image = views[view].render(gaussians, ("color",))
         return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
@@ -237,7 +237,7 @@ def fit_confidence(
     views = sorted(masks)
     targets = {view: from_numpy(mi.TensorXf, masks[view]) for view in views}
 
-    def losses_at(parameters: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+    def losses_at(parameters: Tensors, view: int) -> Tensors:
         trial = replace(gaussians, logit_confidence=parameters["logit_confidence"])
         image = rasterize(
             trial, cameras[view], ("confidence",), detach_weights=("confidence",), config=render

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, field
+from dataclasses import asdict
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt
@@ -142,7 +142,7 @@ class FitConfig:
     num_gaussians: Count | None = None
     """Number of Gaussians of the first frame; None: from the detail of its images and its time (see
     `budget`). It starts from `first_count`."""
-    detail: DetailConfig = field(default_factory=DetailConfig)
+    detail: DetailConfig = DetailConfig()
     """Number of Gaussians where none is given."""
     first_frame_steps: Count | None = None
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see
@@ -159,12 +159,12 @@ class FitConfig:
     refine_cameras: Literal["off", "auto", "on"] = "off"
     """Refine poses and intrinsics on the first frame: off, auto (taken if withheld pixels show that
     they are better) or on (always taken)."""
-    camera_priors: CameraPriors = field(default_factory=CameraPriors)
+    camera_priors: CameraPriors = CameraPriors()
     """Errors that the calibration may have."""
     exposure: Literal["off", "auto", "on"] = "auto"
     """Estimate gain and bias of each camera and frame: off, auto (differences between the cameras
     are taken if withheld pixels show that they are real) or on (always taken)."""
-    short_fits: ShortFitConfig = field(default_factory=ShortFitConfig)
+    short_fits: ShortFitConfig = ShortFitConfig()
     """Fits for the refinement of the cameras and for their exposures."""
     confidence_steps: NonNegativeInt = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
@@ -178,18 +178,16 @@ class FitConfig:
     """Relative decrease of the objective over two epochs below which a later frame ends early; 0:
     never.
     """
-    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    objective: ObjectiveConfig = ObjectiveConfig()
     """Weights of the losses."""
-    density: DensityConfig = field(default_factory=DensityConfig)
+    density: DensityConfig = DensityConfig()
     """Density control."""
-    rates: LearningRates = field(default_factory=LearningRates)
+    rates: LearningRates = LearningRates()
     """Learning rates of every later frame, which `rates_at` adapts to the epoch."""
     decay_means_rate: bool = True
     """Let the learning rate of the means decay within a later frame."""
-    first_frame_rates: LearningRates = field(
-        default_factory=lambda: LearningRates(
-            means=2e-3, scales=0.02, quats=0.02, opacities=0.2, confidence=0.2
-        )
+    first_frame_rates: LearningRates = LearningRates(
+        means=2e-3, scales=0.02, quats=0.02, opacities=0.2, confidence=0.2
     )
     """Learning rates at the start of the first frame. The confidence is fitted alone, at a constant
     rate.

@@ -13,7 +13,7 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians, at_rest, displaced
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
-from morgs_mi.core.types import Tensor
+from morgs_mi.core.types import Tensors
 from morgs_mi.fit.density import DensityControl, apply_plan
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
@@ -127,7 +127,7 @@ def fit_later_frame(
         with dr.suspend_grad():
             return apply_residual(previous, values_of(optimizer), motion)
 
-    def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
+    def losses_at(parameters: Tensors, index: int) -> Tensors:
         """Render one view and return its losses by name."""
         view = active.views[index]
         observed = {**observations[index], **shared}
@@ -230,7 +230,7 @@ def _fit_motion(
     start = start or MotionStart.without_motion(gaussians)
     start_gaussians = displaced(gaussians, start.displacement)
 
-    def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
+    def losses_at(parameters: Tensors, index: int) -> Tensors:
         view = problem.active.views[index]
         image = view.render(moved(start_gaussians, *model.motion(parameters)), ("color",))
         return {

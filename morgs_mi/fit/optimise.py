@@ -12,14 +12,12 @@ import numpy as np
 from drjit.opt import Adam
 
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Tensor
+from morgs_mi.core.types import Tensor, Tensors
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.render.kernel_recording import render_lock
 
-Losses = dict[str, Tensor]
 
-
-def adam(parameters: Mapping[str, Tensor], momentum: float = 0.9) -> Adam:
+def adam(parameters: Tensors, momentum: float = 0.9) -> Adam:
     """Return Adam with these tensors, by name, at their start values.
 
     Args:
@@ -31,7 +29,7 @@ def adam(parameters: Mapping[str, Tensor], momentum: float = 0.9) -> Adam:
     return Adam(lr=1.0, params=dict(parameters), beta_1=momentum, epsilon=1e-15)
 
 
-def values_of(optimizer: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def values_of(optimizer: Tensors) -> Tensors:
     """Return the current parameters, detached."""
     return {name: dr.detach(optimizer[name]) for name in optimizer}
 
@@ -101,7 +99,7 @@ class Steps:
 def optimise(
     optimizer: Adam,
     rates: Mapping[str, float],
-    losses_at: Callable[[Mapping[str, Tensor], int], Losses],
+    losses_at: Callable[[Tensors, int], Tensors],
     steps: Steps,
     weights: Mapping[str, float] | None = None,
 ) -> dict[str, float]:

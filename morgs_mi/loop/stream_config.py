@@ -16,7 +16,6 @@ preset. `core.config` reads settings from TOML files and writes them.
 
 from __future__ import annotations
 
-from dataclasses import field
 from typing import Any, Literal
 
 from morgs_mi.codec.codec_config import CodecConfig
@@ -36,13 +35,13 @@ class StreamConfig:
         >>> config = morgs_mi.StreamConfig(fit=morgs_mi.FitConfig(epochs=4), seed=1)
     """
 
-    fit: FitConfig = field(default_factory=FitConfig)
+    fit: FitConfig = FitConfig()
     """Optimisation of the Gaussians."""
-    motion: MotionConfig = field(default_factory=MotionConfig)
+    motion: MotionConfig = MotionConfig()
     """Motion, offset and confidence."""
-    render: RenderConfig = field(default_factory=RenderConfig)
+    render: RenderConfig = RenderConfig()
     """Rasteriser."""
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = CodecConfig()
     """Precision and size of the stream."""
     seed: NonNegativeInt = 0
     """Seed of every random choice: order of the views, added points."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from typing import Annotated
 
 from annotated_types import Ge, Le
@@ -72,15 +71,15 @@ class MotionConfig:
     """
     model_share: Annotated[float, Ge(0), Le(1)] = 0.5
     """Fraction of a later frame's epochs that fit this model, at least one epoch."""
-    flow: FlowConfig = field(default_factory=FlowConfig)
+    flow: FlowConfig = FlowConfig()
     """Optical flow and its forward-backward check."""
-    masks: MaskConfig = field(default_factory=MaskConfig)
+    masks: MaskConfig = MaskConfig()
     """Motion masks."""
-    search: SearchConfig = field(default_factory=SearchConfig)
+    search: SearchConfig = SearchConfig()
     """Coarse search."""
-    active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)
+    active_set: ActiveSetConfig = ActiveSetConfig()
     """Selection of the Gaussians that a frame may change."""
-    change: ChangeConfig = field(default_factory=ChangeConfig)
+    change: ChangeConfig = ChangeConfig()
     """Detection of changed pixels."""
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ from scipy.sparse import csr_array
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Jit, Tensor
+from morgs_mi.core.types import Jit, Tensor, Tensors
 from morgs_mi.method.method_registry import Registry
 
 
@@ -35,13 +35,13 @@ from morgs_mi.method.method_registry import Registry
 class MotionModel:
     """A motion that N Gaussians share."""
 
-    parameters: Mapping[str, Tensor]  #: Tensors at their start, by name, for which nothing moves.
+    parameters: Tensors  #: Tensors at their start, by name, for which nothing moves.
     rates: Mapping[str, float]  #: Adam's learning rate of each, by name.
     #: Parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity,
     #: wxyz).
-    motion: Callable[[Mapping[str, Tensor]], tuple[Tensor, Tensor]]
+    motion: Callable[[Tensors], tuple[Tensor, Tensor]]
     #: Parameters -> weighted losses in addition to L_recon, by name.
-    losses: Callable[[Mapping[str, Tensor]], dict[str, Tensor]] = lambda parameters: {}
+    losses: Callable[[Tensors], Tensors] = lambda parameters: {}
 
 
 # (N Gaussians of the previous frame, extent of the scene in world units, random generator) ->

@@ -24,7 +24,7 @@ from annotated_types import Ge, Le
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.config import NonNegative, config_class
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.types import Tensor
+from morgs_mi.core.types import Tensor, Tensors
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.losses import flow_loss, mask_loss, offset_loss, recon_loss
@@ -86,7 +86,7 @@ class Prediction:
     """Rendering of one view at one step, which terms compare with the observations."""
 
     image: Image  #: The rendered channels.
-    parameters: Mapping[str, Tensor]  #: Of the residual, by name.
+    parameters: Tensors  #: Of the residual, by name.
     region: Region | None  #: The rendered blocks; None: the whole view.
     num_pixels: int  #: Of the whole view.
     num_gaussians: int  #: Of the whole scene.
@@ -242,7 +242,7 @@ def observe(
 
 
 def active_terms(
-    observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig
+    observations: Observations, parameters: Tensors, config: ObjectiveConfig
 ) -> list[Term]:
     """Return the terms that act in a view with these observations."""
     weights = weights_of(config)
@@ -263,7 +263,7 @@ def channels_of(observations: Observations, config: ObjectiveConfig) -> tuple[st
 
 def losses_of(
     prediction: Prediction, observations: Observations, config: ObjectiveConfig
-) -> dict[str, Tensor]:
+) -> Tensors:
     """Return the losses of one view, by the names of the terms."""
     terms = active_terms(observations, prediction.parameters, config)
     return {term.name: term.loss(prediction, observations, config) for term in terms}

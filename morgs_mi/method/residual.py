@@ -13,8 +13,6 @@ confidence, which carries over.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -22,7 +20,7 @@ import numpy as np
 from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Tensor
+from morgs_mi.core.types import Tensor, Tensors
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
 
@@ -33,7 +31,7 @@ _RESIDUALS = tuple(a.name for a in ATTRIBUTES if a.gate is not None)
 
 def residual_parameters(
     previous: Gaussians, config: MotionConfig, start: MotionStart | None = None
-) -> dict[str, Tensor]:
+) -> Tensors:
     """Return the parameters of one frame's residual at their start.
 
     Args:
@@ -62,9 +60,7 @@ def residual_parameters(
     return parameters
 
 
-def apply_residual(
-    previous: Gaussians, parameters: Mapping[str, Tensor], config: MotionConfig
-) -> Gaussians:
+def apply_residual(previous: Gaussians, parameters: Tensors, config: MotionConfig) -> Gaussians:
     """Return A_{t-1} + m R_t (eq. 12); its `motion` is the displacement of the means.
 
     The displacement is the sum of the flow-guided motion and the learned offset (eq. 8), which is

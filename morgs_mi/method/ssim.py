@@ -45,6 +45,7 @@ from morgs_mi.render.backend import elements, on_aligned_stack
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.region import Region
 
+_Rows = list[list[Float]]  # a row of pixels of each plane
 _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
 
 _C1 = 0.01**2
@@ -193,11 +194,11 @@ def _statistics_pass(
 ) -> tuple[list[Float], Float]:
     """Return the planes of M y and M yy - (M y)^2, and the sum of M y over each run."""
 
-    def moments(read: _Read) -> list[list[Float]]:
+    def moments(read: _Read) -> _Rows:
         y = read(target)
         return [y, [v * v for v in y]]
 
-    def statistics(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+    def statistics(read: _Read, means: _Rows) -> tuple[_Rows, list[Float]]:
         mean, square = means
         return [mean, [dr.fma(-m, m, s) for m, s in zip(mean, square, strict=True)]], mean
 
@@ -217,12 +218,12 @@ def _similarity_pass(
     run.
     """
 
-    def products(read: _Read) -> list[list[Float]]:
+    def products(read: _Read) -> _Rows:
         x = read(image)
         y = read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
-    def similarity(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+    def similarity(read: _Read, means: _Rows) -> tuple[_Rows, list[Float]]:
         terms = [
             _similarity(*values) for values in zip(*means, read(mean), read(variance), strict=True)
         ]
@@ -260,10 +261,10 @@ def _gradient_pass(
 ) -> tuple[list[Float], Float]:
     """Return the planes of dL/dx, and the sum of |x - y| over each run."""
 
-    def unchanged(read: _Read) -> list[list[Float]]:
+    def unchanged(read: _Read) -> _Rows:
         return [read(plane) for plane in derivatives]
 
-    def gradient(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+    def gradient(read: _Read, means: _Rows) -> tuple[_Rows, list[Float]]:
         row = []
         errors = []
         for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *means, strict=True):
@@ -281,8 +282,8 @@ def _walk(
     size: int,
     lanes: Lanes,
     height: Int32,
-    across: Callable[[_Read], list[list[Float]]],
-    finish: Callable[[_Read, list[list[Float]]], tuple[list[list[Float]], list[Float]]],
+    across: Callable[[_Read], _Rows],
+    finish: Callable[[_Read, _Rows], tuple[_Rows, list[Float]]],
     inputs: int,
     outputs: int,
 ) -> tuple[list[Float], Float]:

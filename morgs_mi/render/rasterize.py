@@ -17,7 +17,7 @@ from morgs_mi.core.checks import check_type, kind_of, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
 from morgs_mi.core.png import png_bytes
-from morgs_mi.core.types import Bool, Float, Jit, Tensor
+from morgs_mi.core.types import Bool, Float, Jit, Tensor, Tensors
 from morgs_mi.render.backend import block_shape, elements
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
@@ -61,7 +61,7 @@ class Image:
     motion: Tensor = None
     confidence: Tensor = None
     features: Tensor = None
-    others: Mapping[str, Tensor] = field(default_factory=dict)
+    others: Tensors = field(default_factory=dict)
 
     def __getitem__(self, channel: str) -> Tensor:
         """Return the tensor of a channel.
@@ -250,7 +250,7 @@ def rasterize(
     return _image({name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels})
 
 
-def _image(tensors: Mapping[str, Tensor]) -> Image:
+def _image(tensors: Tensors) -> Image:
     """Return the image with these tensors, by the names of their channels."""
     others = dict(tensors)
     channels = {f.name: others.pop(f.name) for f in fields(Image) if f.name in others}

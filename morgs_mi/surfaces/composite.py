@@ -27,9 +27,8 @@ from morgs_mi.render.channels import NORMALISED
 from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.render.region import Region
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.surfaces.surface_view import SurfaceView
+from morgs_mi.surfaces.surface_view import Crop, SurfaceView
 
-Crop = tuple[int, int, int, int]
 Columns = dict[str, list[Float]]
 
 

@@ -20,14 +20,14 @@ from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.config import check_value
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
-from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.core.types import Float, Tensor, Tensors, UInt32
 from morgs_mi.render.channels import aov_attributes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.surfaces.composite import composite, cropped
-from morgs_mi.surfaces.surface_view import SampledPixels, SurfaceView
+from morgs_mi.surfaces.composite import Columns, composite, cropped
+from morgs_mi.surfaces.surface_view import Crop, SampledPixels, SurfaceView
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class _SceneGaussians:
     motion: Tensor = None
     confidence: Tensor = None
 
-    def __init__(self, tensors: dict[str, Tensor]) -> None:
+    def __init__(self, tensors: Tensors) -> None:
         vars(self).update(tensors)
 
     def rows(self, name: str, index: UInt32) -> list[Float]:
@@ -438,8 +438,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         gaussians: Any,
         cameras: list[Camera],
         channels: tuple[str, ...],
-        crop: tuple[int, int, int, int],
-    ) -> dict[str, list[Float]]:
+        crop: Crop,
+    ) -> Columns:
         """Return the channels of a scene without surfaces, colour in linear light; several views
         beside each other.
         """

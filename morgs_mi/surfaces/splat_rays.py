@@ -73,10 +73,10 @@ class _Tree:
         self,
         ray: Any,
         active: Bool,
-        state: tuple[Jit, ...],
-        visit: Callable[[tuple[Jit, ...], UInt32], tuple[Jit, ...]],
-        span: Callable[[tuple[Jit, ...]], tuple[Float, Float]],
-    ) -> tuple[Jit, ...]:
+        state: Jit,
+        visit: Callable[[Jit, UInt32], Jit],
+        span: Callable[[Jit], tuple[Float, Float]],
+    ) -> Jit:
         """Visit the leaves with boxes that meet a part of each ray, roughly front to back, and
         return the last state.
 
@@ -91,7 +91,7 @@ class _Tree:
         signs = zip(ray.d, self.flips, strict=True)
         flip = sum((dr.select(d < 0, bits, 0) for d, bits in signs), mi.UInt32(0))
 
-        def step(node: UInt32, level: UInt32, state: tuple[Jit, ...]) -> tuple[Any, ...]:
+        def step(node: UInt32, level: UInt32, state: Jit) -> tuple[Any, ...]:
             actual = node ^ (flip >> (self.depth - level))
             corners = (dr.gather(mi.Vector4f, self.boxes, 2 * actual + k) for k in range(2))
             # A ray in the plane of a face gives NaN, which minimum and maximum ignore.
@@ -208,10 +208,10 @@ class SplatRays:
             active: rays that are traced; the others get 1.
         """
 
-        def visit(state: tuple[Jit, ...], leaf: UInt32) -> tuple[Jit, ...]:
+        def visit(state: Jit, leaf: UInt32) -> Jit:
             return (state[0] * (1 - self._response(ray, leaf)[1]),)
 
-        def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
+        def span(state: Jit) -> tuple[Float, Float]:
             return mi.Float(0), dr.select(state[0] < self._config.stop_transmittance, -1, ray.maxt)
 
         with dr.suspend_grad():
@@ -275,7 +275,7 @@ class SplatRays:
         were found.
         """
 
-        def visit(state: tuple[Jit, ...], row: UInt32) -> tuple[Jit, ...]:
+        def visit(state: Jit, row: UInt32) -> Jit:
             depths, rows, count = state
             depths = list(depths)
             rows = list(rows)
@@ -292,7 +292,7 @@ class SplatRays:
                 rows[j] = nearer_row
             return depths, rows, count + dr.select(hit, mi.UInt32(1), 0)
 
-        def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
+        def span(state: Jit) -> tuple[Float, Float]:
             # The largest response of a Gaussian that reaches into the segment may be beyond either
             # end.
             return dr.clip(last[0], 0, ray.maxt), dr.clip(state[0][-1], 0, ray.maxt)

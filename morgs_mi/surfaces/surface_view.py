@@ -28,6 +28,9 @@ from morgs_mi.surfaces.splat_rays import SplatRays
 
 _log = logging.getLogger(__name__)
 
+Crop = tuple[int, int, int, int]
+"""Pixels of a view: (x, y, width, height)."""
+
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
 # Rays of the grid that are cast in every pixel, and the others, row by row.
@@ -152,7 +155,7 @@ class SampledPixels:
     """Pixels of a view, and the samples of an integrator in them."""
 
     camera: Camera  #: The view.
-    crop: tuple[int, int, int, int]  #: Its pixels, (x, y, width, height), P in all.
+    crop: Crop  #: Its pixels, (x, y, width, height), P in all.
     template: Any  #: Sensor with the sampler and the far plane.
     seed: int = 0  #: Seed of the samples.
     spp: int = 0  #: Samples per pixel; 0: the sampler's number.
@@ -303,9 +306,7 @@ class SurfaceView:
         return bool(attached)
 
 
-def coverage_and_depth(
-    scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int]
-) -> tuple[Float, Float]:
+def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> tuple[Float, Float]:
     """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a
     regular grid.
 
@@ -369,9 +370,7 @@ def coverage_and_depth(
     return coverage, depth
 
 
-def _rectangle(
-    box: Any, camera: Camera, crop: tuple[int, int, int, int]
-) -> tuple[np.ndarray, list[int]]:
+def _rectangle(box: Any, camera: Camera, crop: Crop) -> tuple[np.ndarray, list[int]]:
     """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from
     there, (x, y).
     """

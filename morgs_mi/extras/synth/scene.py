@@ -196,10 +196,11 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
             requirement = "its names in Mitsuba must be its own"
             require(not twice, where, requirement, f"{sorted(twice)} twice", "rename one")
             names.update(ids)
-            for time in times if item.pose is not None else ():
+            pose: Any = item.pose
+            for time in times if pose else ():
                 pose_place = f"{where}: its pose at {time:.4g} s"
                 try:
-                    matrix = np.reshape(item.pose(time), (4, 4))
+                    matrix = np.reshape(pose(time), (4, 4))
                 except Exception as error:
                     reason = f"{type(error).__name__}: {error}".rstrip(".")
                     raise ValueError(
