@@ -9,8 +9,8 @@ import pytest
 
 from morgs_mi import Gaussians, StreamLoop, rasterize
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.method.losses import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.method.objective import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close

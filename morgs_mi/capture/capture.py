@@ -25,7 +25,7 @@ from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, time
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points, few
 from morgs_mi.core.color_space import display_stops
-from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.files import CAPTURE
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.video import FrameReader, ImageOrError, open_clips

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.layouts.calibration import Calibration
-from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.files import CAPTURE
 
 TestViews = int | str | Sequence[int | str] | None
 """Held-out cameras: an index, a name, several of these, None for none, or "auto"."""

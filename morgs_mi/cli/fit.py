@@ -24,7 +24,7 @@ from morgs_mi.cli.settings import (
     options,
 )
 from morgs_mi.core.config import Count, check_value, config_toml
-from morgs_mi.core.fit_names import STREAM
+from morgs_mi.core.files import STREAM
 
 if TYPE_CHECKING:
     from morgs_mi.loop.frame_report import FrameReport

@@ -1,4 +1,7 @@
-"""Atomic creation of files and folders, locked folders, and JSON that every reader accepts."""
+"""Atomic creation of files and folders, locked folders, and JSON that every reader accepts.
+
+Names of the files in the folder of a fit, and of a capture's settings.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,16 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+
+STREAM = "stream.morgs"
+"""The stream."""
+PROVISIONAL = "provisional.morgs"
+"""The stream beside it that has a provisional first frame, until the fit has the first frame."""
+REPORT = "report.json"
+"""The report of every frame."""
+CAPTURE = "capture.json"
+"""The path of the capture and how it was read; in a capture, its settings."""
+
 
 _LOCK = ".morgs-lock"
 

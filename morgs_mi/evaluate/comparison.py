@@ -15,7 +15,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, exposed
-from morgs_mi.evaluate.temporal import recorded_change
+from morgs_mi.evaluate.metrics import recorded_change
 from morgs_mi.playback.player import has_confidence, render
 from morgs_mi.playback.stream_header import open_stream_capture, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8

@@ -12,7 +12,7 @@ import numpy as np
 
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.fit_names import REPORT
+from morgs_mi.core.files import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Steps
 from morgs_mi.evaluate.comparison import ComparedClip

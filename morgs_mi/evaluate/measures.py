@@ -24,18 +24,19 @@ from morgs_mi.core.color_space import decode_light
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.metrics import (
     WINDOW,
+    StillVariation,
     delta_e_map,
     endpoint_error,
     iou,
     mean_over,
     psnr_mu,
     psnr_of,
+    slope,
     ssim_map,
     unit_pair,
 )
 from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.results import PlaybackTimes, VariationScores, ViewScores
-from morgs_mi.evaluate.temporal import StillVariation, slope
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import playback_speed
 

@@ -43,7 +43,7 @@ from morgs_mi.fit.optimise import (
     view_order,
 )
 from morgs_mi.fit.view import half_sized
-from morgs_mi.method.losses import mask_loss, recon_loss
+from morgs_mi.method.objective import mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import rasterize

@@ -19,7 +19,6 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
-from morgs_mi.method.losses import recon_loss
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
 from morgs_mi.method.motion_start import MotionStart
@@ -27,6 +26,7 @@ from morgs_mi.method.objective import (
     Prediction,
     channels_of,
     losses_of,
+    recon_loss,
     terms_of,
     weights_of,
 )

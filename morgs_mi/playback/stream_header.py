@@ -22,7 +22,7 @@ from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import bounded, check_number, numbers
 from morgs_mi.core.config import Config, apply_values, types_of
-from morgs_mi.core.fit_names import CAPTURE, STREAM
+from morgs_mi.core.files import CAPTURE, STREAM
 from morgs_mi.render.render_config import RenderConfig
 
 _JSON_TYPES = {

@@ -14,7 +14,7 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.fit_names import PROVISIONAL, STREAM
+from morgs_mi.core.files import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.splats import read_splats, suffix_of

@@ -41,8 +41,15 @@ from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import Entry, StreamReader
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.color_space import TRANSFER
-from morgs_mi.core.files import atomic_path, is_same_file, write_json
-from morgs_mi.core.fit_names import CAPTURE, PROVISIONAL, REPORT, STREAM
+from morgs_mi.core.files import (
+    CAPTURE,
+    PROVISIONAL,
+    REPORT,
+    STREAM,
+    atomic_path,
+    is_same_file,
+    write_json,
+)
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig

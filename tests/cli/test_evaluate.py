@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.core.files import PROVISIONAL
 from tests.cli.commands import assert_refused
 from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording

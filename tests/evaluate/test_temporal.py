@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
+from morgs_mi.evaluate.metrics import StillVariation, recorded_change, slope
 
 rng = np.random.default_rng(0)
 SIZE = (24, 32)

@@ -14,7 +14,7 @@ from morgs_mi.capture.layouts.calibration import Reader, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.extras import extra, places
-from morgs_mi.core.fit_names import CAPTURE, STREAM
+from morgs_mi.core.files import CAPTURE, STREAM
 
 READERS: list[Reader] = [
     colmap.READER,

@@ -32,7 +32,7 @@ from morgs_mi.cli.settings import (
     options,
 )
 from morgs_mi.cli.streams import opened
-from morgs_mi.core.fit_names import STREAM
+from morgs_mi.core.files import STREAM
 from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.calibrate import CalibrateConfig
 from morgs_mi.extras.calibration.checks.plots import write_rig

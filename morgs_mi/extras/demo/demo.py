@@ -16,8 +16,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import locked_folder, write_json
-from morgs_mi.core.fit_names import REPORT
+from morgs_mi.core.files import REPORT, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report, Steps
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.extras.synth.synth_config import SynthConfig

@@ -27,8 +27,7 @@ from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number, require
-from morgs_mi.core.files import atomic_path
-from morgs_mi.core.fit_names import STREAM
+from morgs_mi.core.files import STREAM, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
 from morgs_mi.io.foreign import refuse_foreign

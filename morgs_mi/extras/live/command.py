@@ -22,7 +22,7 @@ from morgs_mi.cli.settings import (
     options,
     setting,
 )
-from morgs_mi.core.fit_names import STREAM
+from morgs_mi.core.files import STREAM
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Live:
     )
 
     def run(self) -> None:
-        from morgs_mi.core.fit_names import PROVISIONAL
+        from morgs_mi.core.files import PROVISIONAL
         from morgs_mi.extras.live.fit_live import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))

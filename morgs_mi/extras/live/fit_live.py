@@ -26,8 +26,7 @@ from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.files import atomic_path, locked_folder, write_json
-from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.files import CAPTURE, atomic_path, locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.png import png_bytes
 from morgs_mi.core.progress import Progress, Report

@@ -30,8 +30,7 @@ from morgs_mi.codec.packets import decode
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.config import Count, apply_values, check_value
 from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import locked_folder, write_json
-from morgs_mi.core.fit_names import REPORT
+from morgs_mi.core.files import REPORT, locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.plots import check_plot
 from morgs_mi.core.progress import Progress, Report

@@ -26,8 +26,7 @@ from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
 from morgs_mi.core.config import check_ranges
-from morgs_mi.core.files import atomic_path, write_json
-from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.files import CAPTURE, atomic_path, write_json
 from morgs_mi.core.memory import check_memory
 from morgs_mi.core.progress import Steps
 from morgs_mi.extras.synth.disturbances import (

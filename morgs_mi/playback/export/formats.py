@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.core.fit_names import STREAM
+from morgs_mi.core.files import STREAM
 
 
 @dataclass(frozen=True)

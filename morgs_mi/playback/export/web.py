@@ -26,8 +26,7 @@ from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER
-from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.core.fit_names import STREAM
+from morgs_mi.core.files import STREAM, atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import seen_points
 from morgs_mi.playback.default_rig import DEFAULT_RIG

@@ -33,7 +33,7 @@ from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE, camera_of_f
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import open_regular
-from morgs_mi.core.fit_names import PROVISIONAL, STREAM
+from morgs_mi.core.files import PROVISIONAL, STREAM
 from morgs_mi.playback.export.web import published_bytes, served_page
 from morgs_mi.playback.stream_header import stream_name
 from morgs_mi.playback.streams import SplatFile

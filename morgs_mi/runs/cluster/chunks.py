@@ -24,8 +24,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import TruncatedStreamError, decode_packet
 from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import locked_folder
-from morgs_mi.core.fit_names import REPORT, STREAM
+from morgs_mi.core.files import REPORT, STREAM, locked_folder
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.frame_report import FrameReport

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.extras.live import command as module
 from morgs_mi.extras.live.command import Live, LiveSettings, _Lines, _summary
 from morgs_mi.extras.live.fit_live import LiveFrame

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.streams import open_stream

@@ -25,7 +25,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
-from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.extras.live.fit_live import write_images
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.player import channel_image, picture
