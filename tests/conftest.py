@@ -2,22 +2,17 @@
 textured planes.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
-from collections.abc import Iterator
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.capture.points import SharedFeatures, match_capture
+from morgs_mi.capture.points import match_capture
 from morgs_mi.capture.truth import GroundTruth, Tracks, save_tracks, save_truth
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.io.video_writer import write_video
@@ -33,7 +28,7 @@ mi.set_variant(os.environ.get("MORGS_MI_TEST_VARIANT", "llvm_ad_rgb"))
 
 
 @pytest.fixture
-def heeds_interrupts() -> Iterator[None]:
+def heeds_interrupts():
     """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the
     background.
     """
@@ -43,20 +38,20 @@ def heeds_interrupts() -> Iterator[None]:
 
 
 @pytest.fixture
-def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_images(monkeypatch):
     """Accept downscaled images that are too small for a fit, which makes tests fast."""
     monkeypatch.setattr("morgs_mi.capture.capture.MIN_SIDE", 1)
 
 
 @pytest.fixture
-def new_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
+def new_attributes(monkeypatch):
     """Add two rows to the table of attributes."""
     for attribute in NEW_ATTRIBUTES:
         monkeypatch.setitem(BY_ACTIVATED_NAME, attribute.activated_name, attribute)
 
 
 @pytest.fixture(scope="session")
-def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fitted_clip(tmp_path_factory):
     """A folder with a capture, its ground truth and its stream; all images are rendered from the
     stream.
     """
@@ -85,12 +80,12 @@ def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def textured_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def textured_capture(tmp_path_factory):
     """Six cameras in front of textured planes."""
     return textured.write_capture(tmp_path_factory.mktemp("rig"))
 
 
 @pytest.fixture(scope="session")
-def textured_features(textured_capture: Capture) -> SharedFeatures:
+def textured_features(textured_capture):
     """The features of `textured_capture` and their matches."""
     return match_capture(textured_capture)

@@ -4,10 +4,7 @@ It fits 80 Gaussians in eight steps and one epoch per later frame, without densi
 for a test that asks what a fit writes, and not for one that asks how good it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
@@ -30,11 +27,7 @@ OPTIONS = ["--num-gaussians", "80", "--first-frame-steps", "8", "--epochs", "1",
 SHORT_FITS = "[fit.short_fits]\ngaussians = 400\nsteps = 30\nrounds = 1\n"
 
 
-def quick(
-    motion: MotionConfig = MOTION,
-    codec: CodecConfig | None = None,
-    **fit: Any,
-) -> StreamConfig:
+def quick(motion=MOTION, codec=None, **fit):
     """Return the quick configuration with some changes.
 
     Args:

@@ -5,12 +5,7 @@ are analytic in their floating-point inputs apart from the documented cut-offs, 
 parts only. So `complex_step` returns derivatives that are exact to rounding.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
-
-from morgs_mi import Camera
 
 SH_C0 = 0.28209479177387814
 SH_C1 = 0.4886025119029199
@@ -24,7 +19,7 @@ SH_C3 = (
 )
 
 
-def sh_basis(d: NDArray, degree: int) -> list:
+def sh_basis(d, degree):
     """Return the real spherical harmonics with 3DGS's signs, up to degree 3, of a unit direction
     [3].
     """
@@ -53,7 +48,7 @@ def sh_basis(d: NDArray, degree: int) -> list:
     return basis
 
 
-def rotation(q: NDArray) -> NDArray:
+def rotation(q):
     """Return the rotation matrix of a wxyz quaternion of any length."""
     w, x, y, z = q / np.sqrt(np.sum(q * q))
     return np.array(
@@ -66,19 +61,19 @@ def rotation(q: NDArray) -> NDArray:
 
 
 def rasterize(
-    raw: dict[str, NDArray],
-    K: NDArray,
-    viewmat: NDArray,
-    width: int,
-    height: int,
-    background: tuple[float, float, float] | None = None,
-    near: float = 0.01,
-    eps2d: float = 0.3,
-    alpha_min: float = 1 / 255,
-    alpha_max: float = 0.99,
-    depth_limit: NDArray | None = None,
-    antialiased: bool = False,
-) -> dict[str, NDArray]:
+    raw,
+    K,
+    viewmat,
+    width,
+    height,
+    background=None,
+    near=0.01,
+    eps2d=0.3,
+    alpha_min=1 / 255,
+    alpha_max=0.99,
+    depth_limit=None,
+    antialiased=False,
+):
     """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest
     first.
 
@@ -177,7 +172,7 @@ def rasterize(
     return {**sums, "alpha": alpha, "margin": np.float64(margin)}
 
 
-def normal_cdf(q: NDArray) -> NDArray:
+def normal_cdf(q):
     """Return the normal distribution function by Page's approximation (1977), which the renderer
     has too.
     """
@@ -185,14 +180,7 @@ def normal_cdf(q: NDArray) -> NDArray:
     return 1 / (1 + np.exp(-2 * np.sqrt(2 / np.pi) * q * (1 + 0.044715 * q * q)))
 
 
-def rasterize_view(
-    raw: dict[str, NDArray],
-    camera: Camera,
-    background: tuple[float, float, float] | None = None,
-    viewmat: NDArray | None = None,
-    depth_limit: NDArray | None = None,
-    antialiased: bool = False,
-) -> dict[str, NDArray]:
+def rasterize_view(raw, camera, background=None, viewmat=None, depth_limit=None, antialiased=False):
     """Return `rasterize` for a camera rounded to float32, as the renderer reads it; `viewmat`
     replaces its pose.
     """
@@ -210,9 +198,7 @@ def rasterize_view(
     )
 
 
-def complex_step(
-    function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30
-) -> dict[str, NDArray]:
+def complex_step(function, inputs, names, step=1e-30):
     """Return the gradient of a real-valued `function(inputs)` with respect to `inputs[name]`, exact
     to rounding.
     """
@@ -228,9 +214,7 @@ def complex_step(
     return grads
 
 
-def directional(
-    function, inputs: dict[str, NDArray], direction: dict[str, NDArray], step: float = 1e-30
-):
+def directional(function, inputs, direction, step=1e-30):
     """Return the derivative of `function(inputs)` along `direction`, exact to rounding; any output
     shape.
     """

@@ -1,7 +1,5 @@
 """The assertion that the tests share: what passes, and what its message reports."""
 
-from __future__ import annotations
-
 import mitsuba as mi
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The check of names and assignments, `tools/check_dialect.py`."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -10,7 +8,7 @@ from pathlib import Path
 TOOL = Path(__file__).parents[1] / "tools/check_dialect.py"
 
 
-def status_and_text(folder: Path, *places: str) -> tuple[int, str]:
+def status_and_text(folder, *places):
     """Return the status of the check of some places in a folder, and what it prints."""
     process = subprocess.run(
         [sys.executable, TOOL, *places], cwd=folder, capture_output=True, text=True
@@ -36,7 +34,7 @@ VIOLATIONS = {
 }
 
 
-def test_check_dialect__names_violations_by_line(tmp_path: Path) -> None:
+def test_check_dialect__names_violations_by_line(tmp_path):
     (tmp_path / "module.py").write_text("\n".join(VIOLATIONS), encoding="utf-8")
     status, text = status_and_text(tmp_path, ".")
     assert status == 1
@@ -46,7 +44,7 @@ def test_check_dialect__names_violations_by_line(tmp_path: Path) -> None:
         assert re.search(rf"^module.py:{number}: .*{part}", text, re.MULTILINE)
 
 
-def test_check_dialect__accepts_other_code(tmp_path: Path) -> None:
+def test_check_dialect__accepts_other_code(tmp_path):
     lines = (
         "a, b = b, a",
         "a, b = f()",
@@ -62,7 +60,7 @@ def test_check_dialect__accepts_other_code(tmp_path: Path) -> None:
     assert status_and_text(tmp_path, ".") == (0, "")
 
 
-def test_check_dialect__takes_modules_and_refuses_to_check_none(tmp_path: Path) -> None:
+def test_check_dialect__takes_modules_and_refuses_to_check_none(tmp_path):
     (tmp_path / "module.py").write_text("A = B = 1\n", encoding="utf-8")
     for places, part in (
         (["module.py"], "one constant"),

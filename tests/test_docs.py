@@ -1,14 +1,10 @@
 """The documentation is consistent with the code: names, links, examples, equations and figures."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import morgs_mi
 import morgs_mi.extras
@@ -29,7 +25,7 @@ EQUATIONS = [(number, name) for number, names in ROWS for name in re.findall(r"`
 GUIDES = {page: text for page, text in PAGES.items() if re.fullmatch(r"docs/[\w-]+\.md", page)}
 
 
-def resolve(path: str) -> Any:
+def resolve(path):
     """Return the module or attribute with a dotted path.
 
     Raises:
@@ -44,7 +40,7 @@ def resolve(path: str) -> Any:
     return None if name in getattr(value, "__dataclass_fields__", ()) else getattr(value, name)
 
 
-def exists(path: str) -> bool:
+def exists(path):
     try:
         resolve(path)
     except AttributeError:
@@ -52,7 +48,7 @@ def exists(path: str) -> bool:
     return True
 
 
-def offenders(pages: dict[str, str], wrong: Callable[[str, str], list]) -> dict[str, list]:
+def offenders(pages, wrong):
     """Return the mistakes of each page; pages without mistakes are left out."""
     return {page: problems for page, text in pages.items() if (problems := wrong(page, text))}
 
@@ -77,7 +73,7 @@ def test_architecture__lists_every_subpackage():
 
 
 def test_pages__name_only_what_exists():
-    def missing(_: str, text: str) -> list[str]:
+    def missing(_, text):
         paths = set(re.findall(r"\bmorgs_mi(?:\.[A-Za-z]\w*)+", text))
         return [path for path in sorted(paths) if not exists(path)]
 
@@ -85,7 +81,7 @@ def test_pages__name_only_what_exists():
 
 
 def test_pages__link_only_to_what_exists():
-    def missing(page: str, text: str) -> list[str]:
+    def missing(page, text):
         prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
         targets = set(re.findall(r"\]\((?!https?://|mailto:|#)([^)\s#]+)", prose))
         folder = (ROOT / page).parent

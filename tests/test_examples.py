@@ -1,7 +1,5 @@
 """The scripts in examples/ run, are short, and write pictures of what they promise."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path
@@ -27,7 +25,7 @@ SIZES = {
 }
 
 
-def run(name: str, *arguments: Path) -> np.ndarray:
+def run(name, *arguments):
     """Run a script with arguments, the last of which is a picture, and return the picture."""
     (path,) = (path for path in EXAMPLES if path.stem == name)
     with pytest.MonkeyPatch.context() as patch:

@@ -2,8 +2,6 @@
 number of files.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -23,7 +21,7 @@ SETUP = next(code for directive, code in BLOCK.findall(TEXT) if directive == "se
 SECTIONS = dict(re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE))
 
 
-def edit(package: Path, directive: str, code: str) -> Path:
+def edit(package, directive, code):
     """Insert code into a copy of the package after a line, and return the file that changes."""
     anchor, name = re.fullmatch(r"after `(.+)` in (.+)", directive).groups()
     path = package / name

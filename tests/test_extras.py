@@ -1,7 +1,5 @@
 """Extras enter themselves: each can be deleted, and other packages can add some."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -61,7 +59,7 @@ assert urlopen(viewer.url).status == 200
 """
 
 
-def environment(*folders: Path) -> dict[str, str]:
+def environment(*folders):
     return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
 
 

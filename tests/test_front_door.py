@@ -1,7 +1,5 @@
 """The front door: what `import morgs_mi` provides."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

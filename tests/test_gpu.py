@@ -1,7 +1,5 @@
 """CUDA against LLVM: the same kernels on both backends. Run with `pytest -m gpu`."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -5,8 +5,6 @@ it.
 `core.extras`.
 """
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 
@@ -38,13 +36,13 @@ ENTRY_POINTS = {ROOT / "__init__.py", ROOT / "__main__.py"}
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path not in ENTRY_POINTS)
 
 
-def subpackage_of(path: Path) -> str:
+def subpackage_of(path):
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
-def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
+def imported_names(tree, package):
     """Return the dotted names that the module imports, relative ones resolved against `package`."""
-    names: list[list[str]] = []
+    names = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names += [alias.name.split(".") for alias in node.names]
@@ -55,7 +53,7 @@ def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
     return names
 
 
-def mistakes(path: Path) -> list[str]:
+def mistakes(path):
     """Return a line for each of the module's imports from a later subpackage."""
     subpackage = subpackage_of(path)
     place = path.relative_to(ROOT)

@@ -1,7 +1,5 @@
 """The notebooks run from top to bottom, and stay small enough for a repository."""
 
-from __future__ import annotations
-
 import base64
 import re
 from pathlib import Path
@@ -47,7 +45,7 @@ stream = lambda: morgs_mi.open_stream(out)
 """
 
 
-def shown(cell) -> dict[str, str]:
+def shown(cell):
     """Return the output of a cell by MIME type, of several elements the last one."""
     return {kind: data for output in cell.outputs for kind, data in output.get("data", {}).items()}
 

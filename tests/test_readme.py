@@ -2,8 +2,6 @@
 exist.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -38,7 +36,7 @@ def test_readme__examples_run(example, workplace, monkeypatch):
     exec(compile(example, "README.md", "exec"), {})
 
 
-def result(name: str) -> dict:
+def result(name):
     return json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
 
 

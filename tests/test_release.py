@@ -1,7 +1,5 @@
 """The release: versions agree, workflows pin their actions and ask for few permissions."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -25,7 +23,7 @@ JOBS = [
 ]
 
 
-def check_release(root: Path, tag: str) -> subprocess.CompletedProcess[str]:
+def check_release(root, tag):
     return subprocess.run(
         [sys.executable, root / "tools/check_release.py", tag], capture_output=True, text=True
     )

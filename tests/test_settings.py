@@ -2,17 +2,14 @@
 range is checked.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import astuple, fields, is_dataclass, replace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
-from morgs_mi import Camera
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.core.config import types_of
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
@@ -37,7 +34,7 @@ BASE = StreamConfig(
     codec=CodecConfig(),
 )
 # Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
-VALUES: dict[str, Any] = {
+VALUES = {
     "motion.flow_method": "dis-ultrafast",
     "motion.mask_method": "superpixels+grabcut",
     "fit.objective.rigid_weight": 1.0,
@@ -57,7 +54,7 @@ VALUES: dict[str, Any] = {
     "render.block_height": 8,
 }
 # Fields that cannot change this stream, each with the reason and the test that shows that it acts.
-ELSEWHERE: dict[str, str] = {
+ELSEWHERE = {
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
     "fit.camera_priors": "the recorder refines cameras: tests/extras/calibration/test_bundle.py",
@@ -77,7 +74,7 @@ ELSEWHERE: dict[str, str] = {
 }
 
 
-def leaves(config: Any, path: str = "") -> list[str]:
+def leaves(config, path=""):
     """Return the dotted names of all fields that hold no further config."""
     names = []
     for field in fields(config):
@@ -87,7 +84,7 @@ def leaves(config: Any, path: str = "") -> list[str]:
     return names
 
 
-def with_value(config: Any, name: str, value: Any) -> Any:
+def with_value(config, name, value):
     """Return a config with the field of a dotted name replaced."""
     head, _, rest = name.partition(".")
     return replace(
@@ -95,13 +92,13 @@ def with_value(config: Any, name: str, value: Any) -> Any:
     )
 
 
-def value_of(config: Any, name: str) -> Any:
+def value_of(config, name):
     for part in name.split("."):
         config = getattr(config, part)
     return config
 
 
-def other(name: str) -> Any:
+def other(name):
     value = value_of(BASE, name)
     if name in VALUES:
         return VALUES[name]
@@ -111,7 +108,7 @@ def other(name: str) -> Any:
 
 
 @pytest.fixture(scope="module")
-def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
+def clip():
     """Five views of a bright textured square in front of a textured wall; it moves, and the light
     grows slowly. Images have the noise of a grey level.
     """
@@ -130,9 +127,7 @@ def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]
     return views, np.concatenate([wall, square]), colors, frames
 
 
-def image(
-    view: Camera, wall: np.ndarray, square: np.ndarray, colors: np.ndarray, t: int
-) -> np.ndarray:
+def image(view, wall, square, colors, t):
     """Draw the points as squares, the far ones first, without noise."""
     drawn = np.full((48, 64, 3), 0.2)
     for points, part, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
@@ -142,14 +137,14 @@ def image(
     return drawn * (1 + 0.01 * t) * 255
 
 
-def stream(clip, config: StreamConfig) -> bytes:
+def stream(clip, config):
     views, points, colors, frames = clip
     loop = StreamLoop(views, points, colors, config)
     return b"".join(loop.push(images)[0].encoded for images in frames)
 
 
 @pytest.fixture(scope="module")
-def base(clip) -> bytes:
+def base(clip):
     assert stream(clip, BASE) == stream(clip, BASE), "the comparison needs a reproducible fit"
     return stream(clip, BASE)
 
@@ -162,12 +157,12 @@ def test_settings__every_field_acts(clip, base, name):
     assert stream(clip, with_value(BASE, name, other(name))) != base
 
 
-def bounds() -> list[tuple[Any, str, Any]]:
+def bounds():
     """Return a config, the name of a field, and a value beyond each of its bounds, for all settings
     of a fit.
     """
     values = []
-    configs: list[Any] = [StreamConfig()]
+    configs = [StreamConfig()]
     for config in configs:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():

@@ -1,7 +1,5 @@
 """The loop: causal, pure, repeatable, without drift, and cheap where nothing moves."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import gc
@@ -15,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, rasterize, stream_loop
+from morgs_mi import rasterize, stream_loop
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, decode
 from morgs_mi.codec.reader import StreamReader
@@ -47,7 +45,7 @@ QUICK = quick(  # from all points, as the images were made of them
 SHORT = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
 
 
-def scene(frame: float) -> tuple[Gaussians, np.ndarray]:
+def scene(frame):
     """A textured ball that moves by SHIFT in front of a static textured wall; and the mask of the
     moving Gaussians.
 
@@ -66,11 +64,11 @@ def scene(frame: float) -> tuple[Gaussians, np.ndarray]:
     return isotropic(np.concatenate([wall, ball]), np.where(moves, 0.09, 0.16), 0.95, sh), moves
 
 
-def cameras() -> list[Camera]:
+def cameras():
     return look_at_cameras([*QUAD, (0, 0, -3.5)], 50, 96, 72, [f"cam{i:02d}" for i in range(5)])
 
 
-def shown(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def shown(gaussians, camera):
     """Return the image of Gaussians, clipped."""
     return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1)
 
@@ -285,7 +283,7 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
     frames = [images[:4] for images in clip]
     frames[1] = [None if view == gone else image for view, image in enumerate(frames[1])]
 
-    def scores() -> list[float]:
+    def scores():
         return [psnr(shown(loop.gaussians, cameras()[4]), images[4] / 255) for images in clip]
 
     score_list = [scores()]
@@ -597,7 +595,7 @@ def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, p
     assert [packet.encoded for packet in packets] == plain
 
 
-def garbage_of(action) -> list[object]:
+def garbage_of(action):
     """Return what only a garbage collection frees after an action."""
     gc.collect()
     gc.disable()
@@ -624,7 +622,7 @@ def test_push__is_interrupted_in_a_callback_and_continues(clip, first, plain, mo
     """Dr.Jit turns the interruption into a RuntimeError; the loop is as it was before the frame."""
     loop = copy.copy(first[0])
 
-    def interrupted() -> None:
+    def interrupted():
         with pytest.raises(KeyboardInterrupt):
             loop.push(clip[1][:4])
 

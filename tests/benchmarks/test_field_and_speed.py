@@ -1,7 +1,5 @@
 """Motion models of other publications, times, and pictures, at a tiny size."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Pages of experiments: tables, claims, commands and figures agree with the committed results."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from importlib import import_module

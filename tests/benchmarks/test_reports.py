@@ -1,7 +1,5 @@
 """Reports at a tiny size, and the measures that their claims rest on."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from importlib import import_module

@@ -1,7 +1,5 @@
 """The report on stability has the cases of the tests, and its committed rows keep their bounds."""
 
-from __future__ import annotations
-
 import json
 import re
 

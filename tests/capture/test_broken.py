@@ -1,7 +1,5 @@
 """Broken captures in every layout, and their messages."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -24,38 +22,38 @@ Damage = Callable[[Path], object]
 # -------------------------------------------------------------------------------------
 
 
-def missing(name: str) -> Damage:
+def missing(name):
     return lambda path: (path / name).unlink()
 
 
-def pipe(name: str) -> Damage:
+def pipe(name):
     """Put a named pipe, from which nothing ever comes, in the place of a file."""
 
-    def damage(path: Path) -> None:
+    def damage(path):
         (path / name).unlink(missing_ok=True)
         os.mkfifo(path / name)
 
     return damage
 
 
-def truncated(name: str) -> Damage:
-    def damage(path: Path) -> None:
+def truncated(name):
+    def damage(path):
         data = (path / name).read_bytes()
         (path / name).write_bytes(data[: len(data) * 2 // 3])
 
     return damage
 
 
-def empty(name: str) -> Damage:
+def empty(name):
     return lambda path: (path / name).write_bytes(b"")
 
 
-def renamed(path: Path) -> None:
+def renamed(path):
     for i, clip in enumerate(sorted(path.glob("*.mkv"))):
         clip.rename(path / f"left{i}.mkv")
 
 
-def headers_only(name: str) -> Damage:
+def headers_only(name):
     """Cut a video after its headers, before the first frame."""
     return lambda path: (path / name).write_bytes((path / name).read_bytes()[:600])
 
@@ -64,8 +62,8 @@ def headers_only(name: str) -> Damage:
 # ------------------------------------------------------------------------------
 
 
-def replace(name: str, old: str, new: str) -> Damage:
-    def damage(path: Path) -> None:
+def replace(name, old, new):
+    def damage(path):
         text = (path / name).read_text()
         assert old in text
         (path / name).write_text(text.replace(old, new, 1))
@@ -73,29 +71,29 @@ def replace(name: str, old: str, new: str) -> Damage:
     return damage
 
 
-def transforms(change: Callable[[dict], object]) -> Damage:
+def transforms(change):
     return in_json("transforms.json", change)
 
 
-def meta(change: Callable[[dict], object]) -> Damage:
+def meta(change):
     return in_json("train_meta.json", change)
 
 
-def in_json(name: str, change: Callable[[dict], object]) -> Damage:
+def in_json(name, change):
     return lambda path: edit(path, change, name)
 
 
-def pose(index: int, scale: float) -> Callable[[dict], None]:
+def pose(index, scale):
     """Scale the first column of a camera's rotation."""
 
-    def change(values: dict) -> None:
+    def change(values):
         for row in values["frames"][index]["transform_matrix"][:3]:
             row[0] *= scale
 
     return change
 
 
-def moving(values: dict) -> None:
+def moving(values):
     values["w2c"][2][values["cam_id"][2].index(10)][0][3] += 0.5
 
 
@@ -329,7 +327,7 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_load_capture__refuses_a_broken_capture(tmp_path, layout) -> None:
+def test_load_capture__refuses_a_broken_capture(tmp_path, layout):
     build, table = LAYOUTS[layout]
     whole = build(tmp_path / "whole")
     mistakes = []
@@ -348,9 +346,7 @@ def test_load_capture__refuses_a_broken_capture(tmp_path, layout) -> None:
 
 
 @pytest.mark.slow
-def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(
-    tmp_path, capsys
-) -> None:
+def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tmp_path, capsys):
     path = layouts.n3dv(tmp_path / "capture")
     (path / "cam02.mkv").unlink()
     old_files = sorted(tmp_path.rglob("*"))

@@ -1,11 +1,8 @@
 """Whole capture folders: layouts, order, downscaling, and broken ones."""
 
-from __future__ import annotations
-
 import logging
 import weakref
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +12,6 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.camera import Camera
 from morgs_mi.extras.calibration.calibrate import calibrate
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.testing import assert_close
@@ -33,14 +29,14 @@ from tests.scenes.captures import (
 )
 
 
-def colmap(path: Path, **kwargs) -> Path:
+def colmap(path, **kwargs):
     names = ("cam01", "cam02")
     write_colmap(path / "sparse" / "0", rig(names, shift=3.0), **kwargs)
     videos(path, names, ".mp4")
     return path
 
 
-def test_frames__releases_the_images_of_past_frames(tmp_path: Path) -> None:
+def test_frames__releases_the_images_of_past_frames(tmp_path):
     """Memory does not grow with the length of a clip."""
     folder = layouts.n3dv(tmp_path / "a")
     for i, clip in enumerate(folder.glob("*.mkv")):
@@ -55,9 +51,7 @@ def test_frames__releases_the_images_of_past_frames(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("small_images")
 @pytest.mark.parametrize("downscale", [2, 3, 4.5])
-def test_load_capture__downscaling_moves_projections_with_the_pixels(
-    tmp_path: Path, downscale: float
-) -> None:
+def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path, downscale):
     names = ("cam01", "cam02")
     point = np.array([0.03, 0.05, 0.02])
     write_colmap(tmp_path / "sparse", rig(names, shift=3.0))
@@ -69,14 +63,14 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(
         assert_close(shown_dot(image), camera.project(point)[0], atol=0.1)
 
 
-def test_load_capture__prefers_lossless_frames(tmp_path: Path) -> None:
+def test_load_capture__prefers_lossless_frames(tmp_path):
     path = layouts.n3dv(tmp_path / "a")
     write_video(path / "frames" / "cam02", frames(77), FPS)
     images = next(load_capture(path).frames()).images
     assert [image[0, 0, 0] for image in images] == [0, 77, 2]
 
 
-def test_load_capture__selects_the_held_out_view(tmp_path: Path) -> None:
+def test_load_capture__selects_the_held_out_view(tmp_path):
     path = layouts.n3dv(tmp_path / "a", tuple(f"cam{i:02}" for i in range(6)))
     capture = load_capture(path)
     assert capture.test_views == (0,)
@@ -93,9 +87,7 @@ def test_load_capture__selects_the_held_out_view(tmp_path: Path) -> None:
     assert load_capture(path).test_views == ()
 
 
-def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(tmp_path, caplog):
     write_video(colmap(tmp_path) / "cam03.mp4", frames(3), FPS)
     with caplog.at_level(logging.WARNING):
         assert load_capture(tmp_path).names == ("cam01", "cam02")
@@ -103,7 +95,7 @@ def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(
 
 
 @pytest.mark.parametrize("without", [["cam02"], ["cam02", "cam03"]])
-def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) -> None:
+def test_load_capture__leaves_cameras_out(tmp_path, without):
     names = tuple(f"cam{i:02}" for i in range(8))
     path = layouts.n3dv(tmp_path / "a", names)
     (path / "cam02.mkv").write_bytes(b"")  # a clip that is not used is not opened
@@ -119,9 +111,7 @@ def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) ->
     assert load_capture(path, test_view=2, reading=reading).test_views == (2,)
 
 
-def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(
-    tmp_path: Path,
-) -> None:
+def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(tmp_path):
     path = layouts.n3dv(tmp_path / "a", tuple(f"cam{i:02}" for i in range(8)))
     (path / "capture.json").write_text('{"test_view": 4}')
     assert load_capture(path, reading=ReadConfig(without=("cam04",))).test_views == (0,)
@@ -130,7 +120,7 @@ def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(
     )
 
 
-def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) -> None:
+def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path):
     path = colmap(tmp_path / "capture")
     terms = (-0.12, 0.02)
     capture = load_capture(path)
@@ -150,7 +140,7 @@ def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) 
     assert recording.distortions == (terms,) * len(cameras)
 
 
-def square(camera: Camera) -> Camera:
+def square(camera):
     """Return a camera with equal focal lengths, as in the lens models with one focal length."""
     K = camera.K.copy()
     K[1, 1] = K[0, 0]
@@ -170,7 +160,7 @@ def square(camera: Camera) -> Camera:
         ("{", "expected JSON"),
     ],
 )
-def test_load_capture__refuses_broken_settings(tmp_path: Path, settings: str, message: str) -> None:
+def test_load_capture__refuses_broken_settings(tmp_path, settings, message):
     (colmap(tmp_path) / "capture.json").write_text(settings)
     with pytest.raises(ValueError, match=f"capture.json: {message}"):
         load_capture(tmp_path)
@@ -200,7 +190,7 @@ def test_load_capture__refuses_broken_settings(tmp_path: Path, settings: str, me
         ),
     ],
 )
-def test_load_capture__refuses_bad_arguments(tmp_path: Path, arguments: dict, message: str) -> None:
+def test_load_capture__refuses_bad_arguments(tmp_path, arguments, message):
     path = colmap(tmp_path)
     with pytest.raises(ValueError, match=message):
         load_capture(path, **arguments)
@@ -210,7 +200,7 @@ def test_load_capture__refuses_bad_arguments(tmp_path: Path, arguments: dict, me
 # --------------------------------------------------------------------------
 
 
-def transparent(t: int = 0, kind: type = np.uint8) -> np.ndarray:
+def transparent(t=0, kind=np.uint8):
     """Return an image [H, W, 4]; its left 10 columns and column 20 + t are transparent."""
     image = np.full((HEIGHT, WIDTH, 4), np.iinfo(kind).max, kind)
     image[:, :10, 3] = 0
@@ -218,7 +208,7 @@ def transparent(t: int = 0, kind: type = np.uint8) -> np.ndarray:
     return image
 
 
-def with_images(path: Path, images: list[np.ndarray], **kwargs) -> Path:
+def with_images(path, images, **kwargs):
     """Write a capture of one camera with images of any channels and type."""
     write_colmap(path / "sparse", [make_camera(0, "cam01")], **kwargs)
     (path / "cam01").mkdir()
@@ -239,7 +229,7 @@ OPAQUE = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
         ([OPAQUE] * 2, False, ""),
     ],
 )
-def test_load_capture__masks_transparent_pixels(tmp_path, images, masked, note) -> None:
+def test_load_capture__masks_transparent_pixels(tmp_path, images, masked, note):
     capture = load_capture(with_images(tmp_path, images))
     assert note in "".join(capture.notes)
     assert bool(note) == bool(capture.notes)
@@ -249,9 +239,7 @@ def test_load_capture__masks_transparent_pixels(tmp_path, images, masked, note) 
         assert capture.metadata()["cameras"][0]["valid_share"] == pytest.approx(1 - 11 / WIDTH)
 
 
-def test_load_capture__masks_what_transparent_pixels_contribute_to(
-    tmp_path: Path, small_images: None
-) -> None:
+def test_load_capture__masks_what_transparent_pixels_contribute_to(tmp_path, small_images):
     lens = Lens("SIMPLE_RADIAL", (0.05,))
     images = [transparent()] * 2
     images[0][images[0][..., 3] < 255, :3] = 0
@@ -267,7 +255,7 @@ def test_load_capture__masks_what_transparent_pixels_contribute_to(
     [np.full((HEIGHT, WIDTH), 200, np.uint8), np.full((HEIGHT, WIDTH, 3), 200 * 257, np.uint16)],
     ids=["grey", "16 bits"],
 )
-def test_load_capture__reads_grey_and_16_bit_images(tmp_path: Path, image: np.ndarray) -> None:
+def test_load_capture__reads_grey_and_16_bit_images(tmp_path, image):
     capture = load_capture(with_images(tmp_path, [image]))
     assert (next(capture.frames()).images[0] == 200).all()
 
@@ -277,7 +265,7 @@ def test_load_capture__reads_grey_and_16_bit_images(tmp_path: Path, image: np.nd
 
 
 @pytest.mark.parametrize("place", ["", "images", "photos"])
-def test_load_capture__reads_photos_as_cameras_of_one_frame(tmp_path: Path, place: str) -> None:
+def test_load_capture__reads_photos_as_cameras_of_one_frame(tmp_path, place):
     names = ("IMG_2", "IMG_3", "IMG_10")
     write_colmap(tmp_path / "sparse/0", rig(names))
     for i, name in enumerate(names):
@@ -295,7 +283,7 @@ def test_load_capture__reads_photos_as_cameras_of_one_frame(tmp_path: Path, plac
     )
 
 
-def test_load_capture__describes_the_folders_that_photos_lack(tmp_path: Path) -> None:
+def test_load_capture__describes_the_folders_that_photos_lack(tmp_path):
     with pytest.raises(
         FileNotFoundError, match=r"found none; .*, or make one folder per camera: cam01/0000"
     ):

@@ -1,7 +1,5 @@
 """The example in docs/captures.md is read as the page describes."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -15,7 +13,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="
 (TRANSFORMS,) = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)
 
 
-def test_captures_page__nerfstudio_example_is_read_as_described(tmp_path: Path) -> None:
+def test_captures_page__nerfstudio_example_is_read_as_described(tmp_path):
     (tmp_path / "transforms.json").write_text(TRANSFORMS)
     PlyData(
         [PlyElement.describe(np.array([(1, 2, 3)], [(a, "f4") for a in "xyz"]), "vertex")]

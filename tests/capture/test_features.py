@@ -2,11 +2,8 @@
 geometry.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import (
     Features,
     Match,
@@ -15,7 +12,7 @@ from morgs_mi.capture.features import (
     reprojection_errors,
     triangulate,
 )
-from morgs_mi.capture.points import SharedFeatures, triangulate_points
+from morgs_mi.capture.points import triangulate_points
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import seen_points
 from morgs_mi.testing import assert_close
@@ -38,7 +35,7 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
     assert match_views(features, [camera, camera]) == []
 
 
-def test_reprojection_errors__are_bounded_by_epipolar_distances() -> None:
+def test_reprojection_errors__are_bounded_by_epipolar_distances():
     """No point can be nearer to both features than half their distance to the epipolar lines, which
     are the rows of cameras side by side.
     """
@@ -55,7 +52,7 @@ def test_reprojection_errors__are_bounded_by_epipolar_distances() -> None:
     assert (errors <= 2 * distance + 1e-6).all()
 
 
-def test_detect__finds_a_blob_at_its_position() -> None:
+def test_detect__finds_a_blob_at_its_position():
     """A blob at a known position, at several image sizes: pixel centres lie at +0.5."""
     for width, height in ((160, 120), (1600, 1200)):
         scale = width / 160
@@ -68,16 +65,14 @@ def test_detect__finds_a_blob_at_its_position() -> None:
         assert_close(nearest, (u, v), atol=0.1 * scale)
 
 
-def test_detect__respects_the_mask(textured_capture: Capture) -> None:
+def test_detect__respects_the_mask(textured_capture):
     image = next(textured_capture.frames()).images[0]
     mask = np.zeros(image.shape[:2], bool)
     mask[:, 160:] = True
     assert detect(image, mask).points[:, 0].min() > 158
 
 
-def test_triangulate__finds_points_on_the_planes(
-    textured_capture: Capture, textured_features: SharedFeatures
-) -> None:
+def test_triangulate__finds_points_on_the_planes(textured_capture, textured_features):
     points, colors = triangulate(
         textured_features.matches, textured_features.features, textured_capture.cameras, 2.0
     )
@@ -96,8 +91,8 @@ def test_triangulate__finds_points_on_the_planes(
 
 
 def test_triangulate__leaves_out_points_with_a_small_angle(
-    textured_capture: Capture, textured_features: SharedFeatures, monkeypatch
-) -> None:
+    textured_capture, textured_features, monkeypatch
+):
     counts = []
     for angle in (1, 20, 60):
         monkeypatch.setattr("morgs_mi.capture.features.MIN_ANGLE", angle)

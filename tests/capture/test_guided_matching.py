@@ -1,21 +1,15 @@
 """Matching with known poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import reprojection_errors
 from morgs_mi.capture.guided_matching import match_guided
-from morgs_mi.capture.points import SharedFeatures
 from tests.scenes.textured import turned
 
 
-def test_match_guided__finds_true_matches(
-    textured_capture: Capture, textured_features: SharedFeatures
-) -> None:
+def test_match_guided__finds_true_matches(textured_capture, textured_features):
     features = textured_features.features
     cameras = textured_capture.cameras
     (match,) = match_guided(features, cameras, [(0, 4)])
@@ -27,9 +21,7 @@ def test_match_guided__finds_true_matches(
     assert np.mean([partners[a] == b for a, b in match.features.tolist() if a in partners]) > 0.95
 
 
-def test_match_guided__finds_next_to_nothing_with_wrong_poses(
-    textured_capture: Capture, textured_features: SharedFeatures
-) -> None:
+def test_match_guided__finds_next_to_nothing_with_wrong_poses(textured_capture, textured_features):
     features = textured_features.features
     cameras = textured_capture.cameras
     (true,) = match_guided(features, cameras, [(0, 4)])
@@ -41,8 +33,8 @@ def test_match_guided__finds_next_to_nothing_with_wrong_poses(
 
 
 def test_match_guided__rejects_patches_of_another_size_or_orientation(
-    textured_capture: Capture, textured_features: SharedFeatures
-) -> None:
+    textured_capture, textured_features
+):
     features = list(textured_features.features)
     cameras = textured_capture.cameras
     (true,) = match_guided(features, cameras, [(0, 4)])

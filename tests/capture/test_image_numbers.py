@@ -1,10 +1,6 @@
 """Folders of images whose numbers differ among the cameras."""
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Iterable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +17,7 @@ TRIM = ReadConfig(trim=True)
 GAPS = ReadConfig(gaps=True)
 
 
-def capture_of(path: Path, **cameras: Iterable[int]) -> Path:
+def capture_of(path, **cameras):
     """Write folders of images with the numbers of each camera; the colour is the number."""
     layouts.n3dv(path, tuple(cameras), lambda *_: None)
     for name, numbers in cameras.items():
@@ -43,7 +39,7 @@ DIFFERENT = [
 
 
 @pytest.mark.parametrize(("a", "b", "common", "interval"), DIFFERENT)
-def test_align_numbers__are_times(tmp_path: Path, caplog, a, b, common, interval) -> None:
+def test_align_numbers__are_times(tmp_path, caplog, a, b, common, interval):
     path = capture_of(tmp_path / "c", a=a, b=b, c=a)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=TRIM)
@@ -59,7 +55,7 @@ def test_align_numbers__are_times(tmp_path: Path, caplog, a, b, common, interval
         assert [row[camera] for row in timestamps if row[camera] is not None] == list(numbers)
 
 
-def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(tmp_path) -> None:
+def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(tmp_path):
     path = capture_of(tmp_path / "c", a=range(4), b=range(2, 6))
     message = r"got a 0 to 3, b 2 to 5; use the 2 common .*--trim, .*--gaps.*--offset a 0"
     with pytest.raises(ValueError, match=message):
@@ -69,7 +65,7 @@ def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(tm
     assert "aligned by their positions and --offset" in capture.notes[0]
 
 
-def test_align_numbers__without_a_common_one_are_refused(tmp_path: Path) -> None:
+def test_align_numbers__without_a_common_one_are_refused(tmp_path):
     path = capture_of(tmp_path / "c", a=range(0, 6, 2), b=range(1, 7, 2))
     for reading in (ReadConfig(), TRIM):
         with pytest.raises(
@@ -79,9 +75,7 @@ def test_align_numbers__without_a_common_one_are_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("reading", [ReadConfig(), TRIM, GAPS])
-def test_align_numbers__that_do_not_overlap_count_separately(
-    tmp_path: Path, caplog, reading: ReadConfig
-) -> None:
+def test_align_numbers__that_do_not_overlap_count_separately(tmp_path, caplog, reading):
     path = capture_of(tmp_path / "c", a=range(100, 105), b=range(40, 45), c=range(40, 45))
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=reading)
@@ -90,7 +84,7 @@ def test_align_numbers__that_do_not_overlap_count_separately(
     assert capture.notes[0] in caplog.text
 
 
-def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path: Path) -> None:
+def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path):
     for cameras in (
         {"a": range(3, 6), "b": range(3, 6)},
         {"a": [1], "b": [2]},
@@ -106,7 +100,7 @@ def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path: Path)
 
 
 @pytest.mark.parametrize("reading", [ReadConfig(), GAPS])
-def test_align_numbers__are_those_that_change(tmp_path: Path, reading: ReadConfig) -> None:
+def test_align_numbers__are_those_that_change(tmp_path, reading):
     path = capture_of(tmp_path / "c", a1=range(3), a2=range(3))
     for file in [*path.glob("a*/*.png")]:
         file.rename(file.with_stem(f"{file.stem}_{file.parent.name}"))
@@ -119,7 +113,7 @@ def test_align_numbers__are_those_that_change(tmp_path: Path, reading: ReadConfi
         load_capture(path, reading=reading)
 
 
-def test_align_numbers__shifts_videos_beside_them(tmp_path: Path) -> None:
+def test_align_numbers__shifts_videos_beside_them(tmp_path):
     """A video begins with the first number."""
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
     layouts.write_poses_bounds(
@@ -130,12 +124,12 @@ def test_align_numbers__shifts_videos_beside_them(tmp_path: Path) -> None:
     assert frame_numbers(load_capture(path, reading=TRIM)) == [[t, t, t] for t in range(2, 6)]
 
 
-def test_align_numbers__with_trim_are_the_base_of_offsets(tmp_path: Path) -> None:
+def test_align_numbers__with_trim_are_the_base_of_offsets(tmp_path):
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
     capture = load_capture(path, reading=ReadConfig(trim=True, offset={"b": 1}))
     assert frame_numbers(capture) == [[t, t + 1] for t in range(1, 6)]
 
 
-def test_counting_together__groups_overlapping_numbers() -> None:
+def test_counting_together__groups_overlapping_numbers():
     numbers = {"a": [0, 9], "b": [5, 20], "c": [21, 30], "d": [15, 16], "e": [100]}
     assert counting_together(numbers) == [["a", "b", "d"], ["c"], ["e"]]

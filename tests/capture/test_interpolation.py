@@ -1,7 +1,5 @@
 """Images between two frames of a clip."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -13,13 +11,13 @@ HEIGHT = 72
 WIDTH = 96
 
 
-def texture() -> np.ndarray:
+def texture():
     """Return a smooth random image [2H, 2W, 3]."""
     noise = np.random.default_rng(0).uniform(0, 255, (2 * HEIGHT, 2 * WIDTH, 3))
     return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
 
 
-def moving_square(position: float) -> np.ndarray:
+def moving_square(position):
     """Return a textured square at some column before a static background, uint8."""
     layer = np.zeros((HEIGHT, WIDTH, 4))
     layer[20:52, 30:62, :3] = texture()[20:52, 30:62]
@@ -32,7 +30,7 @@ def moving_square(position: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
-def test_image_between__shows_things_where_they_have_moved_to(share: float) -> None:
+def test_image_between__shows_things_where_they_have_moved_to(share):
     first = moving_square(0)
     second = moving_square(4)
     expected = moving_square(4 * share)
@@ -47,6 +45,6 @@ def test_image_between__shows_things_where_they_have_moved_to(share: float) -> N
 
 
 @pytest.mark.parametrize("share", [0, 1])
-def test_image_between__is_a_frame_at_either_end(share: float) -> None:
+def test_image_between__is_a_frame_at_either_end(share):
     frames = moving_square(0), moving_square(4)
     np.testing.assert_allclose(image_between(*frames, share).astype(int), frames[share], atol=1)

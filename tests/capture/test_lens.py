@@ -1,7 +1,5 @@
 """Undistortion against OpenCV's own projection through the lens."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -21,19 +19,19 @@ LENSES = {
 }
 
 
-def camera(focal: float = 110.0) -> Camera:
+def camera(focal=110.0):
     K = np.array([[focal, 0, 71.3], [0, 1.05 * focal, 66.8], [0, 0, 1]])
     return Camera(K, np.eye(4), WIDTH, HEIGHT, "cam")
 
 
-def dots(centres: np.ndarray) -> np.ndarray:
+def dots(centres):
     """Draw a blob at each centre [N, 2], in pixels with centres at +0.5."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) for u, v in centres)
     return np.repeat((250 * np.clip(image, 0, 1))[..., None], 3, -1).astype(np.uint8)
 
 
-def project(lens: Lens, points: np.ndarray, cam: Camera | None = None) -> np.ndarray:
+def project(lens, points, cam=None):
     """Return the positions [N, 2] of points in the frame of `camera`, or of `cam`, seen through the
     lens, with centres at +0.5.
     """
@@ -43,7 +41,7 @@ def project(lens: Lens, points: np.ndarray, cam: Camera | None = None) -> np.nda
     return through(points[:, None], zero, zero, K, lens.opencv_coefficients)[0].reshape(-1, 2) + 0.5
 
 
-def assert_centred(image: np.ndarray, expected: np.ndarray) -> None:
+def assert_centred(image, expected):
     """Assert that blobs [N, 2] lie where they are expected, as far from each other as these."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     for u, v in expected:
@@ -54,7 +52,7 @@ def assert_centred(image: np.ndarray, expected: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> None:
+def test_undistortion__moves_points_to_their_pinhole_projections(model):
     cam = camera()
     lens = Lens(model, LENSES[model])
     points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
@@ -67,7 +65,7 @@ def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> 
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
-def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
+def test_undistortion__removes_what_a_refined_lens_leaves(model):
     cam = camera()
     lens = Lens(model, LENSES.get(model, ()))
     refined = camera(112.0)
@@ -80,12 +78,12 @@ def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
     assert_centred(image, refined.project(points)[0])
 
 
-def test_undistortion__is_none_without_distortion() -> None:
+def test_undistortion__is_none_without_distortion():
     assert undistortion(camera(), Lens()) is None
     assert undistortion(camera(), Lens("OPENCV", (0.0, 0.0, 0.0, 0.0))) is None
 
 
-def test_undistortion__masks_the_empty_corners_of_a_pincushion() -> None:
+def test_undistortion__masks_the_empty_corners_of_a_pincushion():
     pincushion, barrel = (
         undistortion(camera(), Lens("SIMPLE_RADIAL", (k1,))).mask for k1 in (0.3, -0.1)
     )
@@ -98,7 +96,7 @@ def test_undistortion__masks_the_empty_corners_of_a_pincushion() -> None:
     ("model", "radius"),
     [("SIMPLE_RADIAL", 1.5**-0.5), ("OPENCV_FISHEYE", np.tan(1.5**-0.5))],
 )
-def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, radius: float) -> None:
+def test_undistortion__mask_ends_where_the_polynomial_folds(model, radius):
     """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of
     tangent 1.066.
     """
@@ -121,9 +119,7 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, radius: 
         ((1, 2, 3, 4, 5, 6, 7, 8), "FULL_OPENCV", (1, 2, 3, 4, 5, 6, 7, 8)),
     ],
 )
-def test_opencv_lens__keeps_the_order_of_opencv(
-    coefficients: tuple, model: str, distortion: tuple
-) -> None:
+def test_opencv_lens__keeps_the_order_of_opencv(coefficients, model, distortion):
     lens = opencv_lens(coefficients)
     assert (lens.model, lens.distortion) == (model, distortion)
     np.testing.assert_array_equal(lens.opencv_coefficients[: len(coefficients)], coefficients)

@@ -1,9 +1,6 @@
 """Captures of EXR files, which have linear light."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,14 +19,14 @@ from tests.scenes.captures import HEIGHT, WIDTH, rig
 NAMES = ("cam01", "cam02")
 
 
-def light(camera: int, frame: int) -> np.ndarray:
+def light(camera, frame):
     rng = np.random.default_rng([camera, frame])
     image = 0.5 * rng.random((HEIGHT, WIDTH, 3), np.float32)
     image[: HEIGHT // 4] *= 16
     return image
 
 
-def recorded(path: Path, alpha: np.ndarray | None = None, **kwargs) -> Path:
+def recorded(path, alpha=None, **kwargs):
     write_colmap(path / "sparse" / "0", rig(NAMES, shift=3.0), **kwargs)
     for camera, name in enumerate(NAMES):
         (path / name).mkdir(parents=True)
@@ -41,7 +38,7 @@ def recorded(path: Path, alpha: np.ndarray | None = None, **kwargs) -> Path:
     return path
 
 
-def test_load_capture__reads_sequences_of_exr_files(tmp_path: Path) -> None:
+def test_load_capture__reads_sequences_of_exr_files(tmp_path):
     capture = load_capture(recorded(tmp_path))
     for t, frame in enumerate(capture.frames()):
         for camera, image in enumerate(frame.images):
@@ -54,7 +51,7 @@ def test_load_capture__reads_sequences_of_exr_files(tmp_path: Path) -> None:
     assert load_capture(tmp_path).display_exposure == -2
 
 
-def test_load_capture__masks_transparent_pixels_of_exr_files(tmp_path: Path) -> None:
+def test_load_capture__masks_transparent_pixels_of_exr_files(tmp_path):
     alpha = np.ones((HEIGHT, WIDTH))
     alpha[:, : WIDTH // 2] = 0.9
     capture = load_capture(recorded(tmp_path, alpha))
@@ -63,7 +60,7 @@ def test_load_capture__masks_transparent_pixels_of_exr_files(tmp_path: Path) -> 
     assert "cam01: 50.0 % of its pixels are transparent and masked out." in capture.notes
 
 
-def test_load_capture__prefers_images_of_8_bits_to_exr_files_beside_them(tmp_path: Path) -> None:
+def test_load_capture__prefers_images_of_8_bits_to_exr_files_beside_them(tmp_path):
     recorded(tmp_path)
     for name in NAMES:
         for frame in range(2):
@@ -75,7 +72,7 @@ def test_load_capture__prefers_images_of_8_bits_to_exr_files_beside_them(tmp_pat
     assert next(capture.frames()).images[0].dtype == np.uint8
 
 
-def test_process__averages_light_when_it_downscales(tmp_path: Path) -> None:
+def test_process__averages_light_when_it_downscales(tmp_path):
     capture = load_capture(recorded(tmp_path))
     small = capture.cameras[0].resized(WIDTH // 2, HEIGHT // 2)
     blocks = light(0, 0).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
@@ -83,19 +80,19 @@ def test_process__averages_light_when_it_downscales(tmp_path: Path) -> None:
     np.testing.assert_allclose(smaller.process(0, light(0, 0)), blocks, rtol=1e-5)
 
 
-def test_process__keeps_light_positive_through_undistortion(tmp_path: Path) -> None:
+def test_process__keeps_light_positive_through_undistortion(tmp_path):
     lens = Lens("SIMPLE_RADIAL", (0.05,))
     image = next(load_capture(recorded(tmp_path, lenses=[lens] * 2)).frames()).images[0]
     assert image.min() >= 0
     assert image.max() > 4
 
 
-def test_image_between__of_equal_images_is_the_image() -> None:
+def test_image_between__of_equal_images_is_the_image():
     image = light(0, 0)
     np.testing.assert_allclose(image_between(image, image, 0.5), image, rtol=1e-4, atol=1e-6)
 
 
-def test_partial_frames__leave_out_a_broken_file(tmp_path: Path) -> None:
+def test_partial_frames__leave_out_a_broken_file(tmp_path):
     broken = recorded(tmp_path) / "cam02" / "0001.exr"
     broken.write_bytes(broken.read_bytes()[:900])
     _, frame = load_capture(tmp_path).partial_frames()
@@ -104,7 +101,7 @@ def test_partial_frames__leave_out_a_broken_file(tmp_path: Path) -> None:
     assert "the file may be truncated" in frame.problems[0]
 
 
-def test_stream_metadata__names_the_transfer_of_light_alone(tmp_path: Path) -> None:
+def test_stream_metadata__names_the_transfer_of_light_alone(tmp_path):
     capture = load_capture(recorded(tmp_path))
     first = next(capture.partial_frames())
     transfer = stream_metadata(capture, first, StreamConfig())["transfer"]

@@ -2,10 +2,7 @@
 the others.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +10,6 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.initialise import from_points
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import to_uint8, write_png
@@ -26,12 +21,12 @@ from tests.scenes.cameras import circle, look_at_cameras
 RADIUS = 0.08  # of the dark ball around camera 0
 
 
-def dome() -> list[Camera]:
+def dome():
     """Return eight cameras on a circle, of which the opposite ones see camera 0 above the scene."""
     return look_at_cameras(circle(np.arange(8) * np.pi / 4, 3.0, z=0.9), 60, 96, 72, up=(0, 0, 1))
 
 
-def scene() -> tuple[np.ndarray, np.ndarray]:
+def scene():
     """Return points and colours of a bright cube in the middle and a dark ball around camera 0."""
     rng = np.random.default_rng(0)
     cube = rng.uniform(-0.8, 0.8, (400, 3))
@@ -41,7 +36,7 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([cube, dome()[0].position + ball]), colors
 
 
-def splats() -> Gaussians:
+def splats():
     points, colors = scene()
     gaussians = from_points(points, colors, 0, opacity=0.9)
     dark = np.arange(len(points)) >= 400
@@ -49,14 +44,14 @@ def splats() -> Gaussians:
     return replace(gaussians, log_scales=log_scales)
 
 
-def image(camera: Camera, gaussians: Gaussians) -> np.ndarray:
+def image(camera, gaussians):
     return to_uint8(
         np.asarray(rasterize(gaussians, camera, ("color",), background=(0.5, 0.5, 0.5)).color)
     )
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Path:
+def capture(tmp_path):
     """A capture whose camera 0, held out, has photographed the scene without the ball around
     itself.
     """
@@ -68,7 +63,7 @@ def capture(tmp_path: Path) -> Path:
     return path
 
 
-def test_load_capture__near_plane_is_behind_a_splat_around_a_held_out_camera(capture: Path) -> None:
+def test_load_capture__near_plane_is_behind_a_splat_around_a_held_out_camera(capture):
     camera = load_capture(capture).cameras[0]
     shown, true = (image(camera, s) for s in (splats(), splats().select(np.arange(400))))
     assert np.array_equal(shown, true)
@@ -78,14 +73,12 @@ def test_load_capture__near_plane_is_behind_a_splat_around_a_held_out_camera(cap
 
 
 @pytest.mark.slow
-def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(
-    capture: Path, tmp_path: Path
-) -> None:
+def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(capture, tmp_path):
     stream_capture(load_capture(capture, reading=ReadConfig(near=0.3)), tmp_path / "out", quick())
     assert {camera.near for camera in open_stream(tmp_path / "out").cameras} == {0.3}
 
 
-def test_capture__keeps_near_planes_at_the_recorded_size(capture: Path) -> None:
+def test_capture__keeps_near_planes_at_the_recorded_size(capture):
     reading = ReadConfig(near=0.3)
     recording = load_capture(capture, downscale=2, reading=reading)
     assert {camera.near for camera in recording.cameras} == {0.3}
@@ -93,8 +86,6 @@ def test_capture__keeps_near_planes_at_the_recorded_size(capture: Path) -> None:
 
 
 @pytest.mark.parametrize("near", [0.0, float("inf")])
-def test_load_capture__refuses_a_near_plane_that_is_not_positive(
-    capture: Path, near: float
-) -> None:
+def test_load_capture__refuses_a_near_plane_that_is_not_positive(capture, near):
     with pytest.raises(ValueError, match="`near` must"):
         load_capture(capture, reading=ReadConfig(near=near))

@@ -1,9 +1,5 @@
 """Outputs must lie outside of captures."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from morgs_mi.capture.outputs import check_output
@@ -21,7 +17,7 @@ from tests.scenes.captures import (
 @pytest.mark.parametrize(
     "build", [colmap, nerfstudio, dynamic3dgs, n3dv, meet_room, anipose, qualisys]
 )
-def test_check_output__refuses_captures_of_every_layout(tmp_path: Path, build) -> None:
+def test_check_output__refuses_captures_of_every_layout(tmp_path, build):
     capture = build(tmp_path / "clip")
     (tmp_path / "link").symlink_to(capture)
     for path in (
@@ -37,13 +33,13 @@ def test_check_output__refuses_captures_of_every_layout(tmp_path: Path, build) -
             check_output(path)
 
 
-def test_check_output__accepts_the_folder_around_a_capture(tmp_path: Path) -> None:
+def test_check_output__accepts_the_folder_around_a_capture(tmp_path):
     colmap(tmp_path / "clip")
     for path in (tmp_path, tmp_path / "clip-fit", tmp_path / "clip.mp4"):
         assert check_output(path) == path
 
 
-def test_check_output__ignores_other_toml_files_around(tmp_path: Path) -> None:
+def test_check_output__ignores_other_toml_files_around(tmp_path):
     """They may be broken, or not be files at all."""
     (tmp_path / "pyproject.toml").write_bytes(b"\xff[[")
     (tmp_path / "folder.toml").mkdir()

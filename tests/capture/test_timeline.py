@@ -1,22 +1,18 @@
 """Clips with different lengths, rates and starts, and missing images."""
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.main import main
 from morgs_mi.io.video_writer import write_video
 from tests.scenes import captures as layouts
 
 
-def capture_of(path: Path, clips: dict[str, tuple[int, float]], levels: int = 1) -> Path:
+def capture_of(path, clips, levels=1):
     """Write clips given by number of frames and frame rate; frame t of camera i is filled with (i,
     t, 0) times `levels`.
     """
@@ -27,7 +23,7 @@ def capture_of(path: Path, clips: dict[str, tuple[int, float]], levels: int = 1)
     return path
 
 
-def frame_numbers(capture: Capture) -> list[list[int | None]]:
+def frame_numbers(capture):
     """Return per timestamp the frame of each clip, None for a missing image."""
     frames = capture.partial_frames()
     return [
@@ -56,7 +52,7 @@ def frame_numbers(capture: Capture) -> list[list[int | None]]:
         ({"a": (2, 25), "b": (3, 25)}, ReadConfig(gaps=True), 25, [[0, 0], [1, 1], [None, 2]]),
     ],
 )
-def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, timestamps) -> None:
+def test_timeline__aligns_clips(tmp_path, clips, config, fps, timestamps):
     capture = load_capture(capture_of(tmp_path / "c", clips), reading=config)
     assert capture.fps == pytest.approx(fps, abs=0.01)
     assert capture.num_frames == len(timestamps)
@@ -64,7 +60,7 @@ def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, timestamps) 
     assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(timestamps)))
 
 
-def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path) -> None:
+def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (5, 25), "b": (5, 25)}, 40)
     capture = load_capture(path, reading=ReadConfig(offset={"b": -1.25}))
     # At frames 2, 3 and 4 of a, b would show its frames 0.75, 1.75 and 2.75. Only the first image
@@ -93,14 +89,14 @@ def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path)
 )
 def test_timeline__delays_or_interpolates_clips_of_other_rates(
     tmp_path, rates, offset, timestamps, delays
-) -> None:
+):
     clips = {name: (5, fps) for name, fps in zip("ab", rates, strict=True)}
     capture = load_capture(capture_of(tmp_path / "c", clips, 40), reading=ReadConfig(offset=offset))
     assert [camera.delay for camera in capture.cameras] == delays
     assert frame_numbers(capture)[: len(timestamps)] == timestamps
 
 
-def test_load_capture__reads_the_readout_of_cameras(tmp_path: Path) -> None:
+def test_load_capture__reads_the_readout_of_cameras(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (3, 25), "b": (6, 50)})
     for setting, expected in (("0.6", [0.6, 0.3]), ('{"b": -0.5}', [0, -0.25])):
         (path / "capture.json").write_text(f'{{"readout": {setting}}}')
@@ -108,7 +104,7 @@ def test_load_capture__reads_the_readout_of_cameras(tmp_path: Path) -> None:
         assert [camera.readout for camera in capture.cameras] == expected
 
 
-def test_timeline__uses_the_true_rate_and_the_frame_limit_for_aligned_clips(tmp_path: Path) -> None:
+def test_timeline__uses_the_true_rate_and_the_frame_limit_for_aligned_clips(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 50)})
     (path / "capture.json").write_text('{"fps": 20}')
     capture = load_capture(path, max_frames=2, reading=ReadConfig(offset={"b": 1}))
@@ -120,7 +116,7 @@ def test_timeline__uses_the_true_rate_and_the_frame_limit_for_aligned_clips(tmp_
 RATES = {"a": (300, 30.0), "b": (300, 29.7), "c": (300, 29.97)}
 
 
-def moments(capture: Capture, clips: dict[str, tuple[int, float]]) -> np.ndarray:
+def moments(capture, clips):
     """Return the times of the images of each timestamp [T, C] in s; the clips of `capture_of` begin
     together.
     """
@@ -133,9 +129,7 @@ def moments(capture: Capture, clips: dict[str, tuple[int, float]]) -> np.ndarray
 
 
 @pytest.mark.parametrize("config", [ReadConfig(offset={"b": 0}), ReadConfig(trim=True, gaps=True)])
-def test_timeline__uses_rates_that_are_less_than_a_percent_apart(
-    tmp_path: Path, caplog, config: ReadConfig
-) -> None:
+def test_timeline__uses_rates_that_are_less_than_a_percent_apart(tmp_path, caplog, config):
     path = capture_of(tmp_path / "c", RATES)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=config)
@@ -147,7 +141,7 @@ def test_timeline__uses_rates_that_are_less_than_a_percent_apart(
     assert f"images of one timestamp are up to {1e3 * spread:.0f}"[:-1] in caplog.text
 
 
-def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path: Path, caplog) -> None:
+def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path, caplog):
     path = capture_of(tmp_path / "c", RATES)
     with pytest.raises(
         ValueError, match=r"same frame rate, got a.mkv 30, .* up to 3.0 frames apart; .*--trim"
@@ -160,7 +154,7 @@ def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path: Pat
     assert load_capture(path).num_frames == 300
 
 
-def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
+def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 25)})
     late = timed(tmp_path / "d", a=REGULAR, b=LATE)
     for folder in (path, late):
@@ -170,21 +164,19 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
     assert load_capture(late, reading=ReadConfig(trim=True)).truth is None
 
 
-def test_timeline__refuses_clips_of_different_lengths(tmp_path) -> None:
+def test_timeline__refuses_clips_of_different_lengths(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 25)})
     message = r"number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* --offset"
     with pytest.raises(ValueError, match=message):
         load_capture(path)
 
 
-def test_read_config__refuses_an_offset_that_is_not_finite() -> None:
+def test_read_config__refuses_an_offset_that_is_not_finite():
     with pytest.raises(ValueError, match="`offset` must be a table, each value a finite number"):
         ReadConfig(offset={"b": np.nan})
 
 
-def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(
-    tmp_path: Path,
-) -> None:
+def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (6, 25), "b": (6, 25)})
     data = (path / "b.mkv").read_bytes()
     (path / "b.mkv").write_bytes(data[: len(data) * 2 // 3])
@@ -207,7 +199,7 @@ LATE = [0, 50, 100, 250, 300]
 JITTER = [0, 60, 95, 140, 200, 255, 300]
 
 
-def timed(path: Path, **times: list[int]) -> Path:
+def timed(path, **times):
     """Write clips given by the times of their frames in milliseconds; frame t of camera i is filled
     with (i, t, 0).
     """
@@ -249,15 +241,13 @@ def timed(path: Path, **times: list[int]) -> Path:
         ({"a": REGULAR, "b": JITTER}, ReadConfig(), [[t, t] for t in range(7)]),
     ],
 )
-def test_timeline__synchronises_variable_frame_rates_by_time(
-    tmp_path: Path, times, config, timestamps
-) -> None:
+def test_timeline__synchronises_variable_frame_rates_by_time(tmp_path, times, config, timestamps):
     capture = load_capture(timed(tmp_path / "c", **times), reading=config)
     assert capture.fps == pytest.approx(20, rel=0.01)
     assert frame_numbers(capture) == timestamps
 
 
-def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> None:
+def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path):
     path = timed(tmp_path / "c", a=REGULAR[:5], b=LATE)
     with pytest.raises(
         ValueError,
@@ -267,7 +257,7 @@ def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> N
     assert load_capture(path, max_frames=3).num_frames == 3
 
 
-def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path: Path) -> None:
+def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path):
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
     assert load_capture(path, reading=ReadConfig(trim=True)).notes == (
         "b.mp4: variable frame rate, 5 frames in 7 periods of 50.0 ms, up to 0.0 ms off; each "
@@ -282,20 +272,18 @@ def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path: P
     assert load_capture(regular).notes == ()
 
 
-def test_info_command__reports_a_variable_frame_rate(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_info_command__reports_a_variable_frame_rate(tmp_path, capsys):
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
     assert main(["info", str(path), "--no-check", "--trim"]) == 0
     assert "b.mp4: variable frame rate, 5 frames in 7 periods" in capsys.readouterr().out
 
 
-def images(path: Path, names: Sequence[str] = ("cam_0", "cam_2", "cam_10")) -> Path:
+def images(path, names=("cam_0", "cam_2", "cam_10")):
     """Write three folders of images 0000.png ... 0003.png."""
     return layouts.n3dv(path, tuple(names), layouts.folder_per_camera)
 
 
-def test_partial_frames__leave_out_missing_and_broken_images(tmp_path: Path, caplog) -> None:
+def test_partial_frames__leave_out_missing_and_broken_images(tmp_path, caplog):
     """Images are aligned by number; even the first, which determines the size, may be missing."""
     path = images(tmp_path / "c")
     (path / "cam_0" / "0000.png").unlink()
@@ -313,7 +301,7 @@ def test_partial_frames__leave_out_missing_and_broken_images(tmp_path: Path, cap
     assert "frame 2: cam_2 is left out: " in caplog.text
 
 
-def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path: Path) -> None:
+def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path):
     path = layouts.meet_room(tmp_path / "c", layouts.folder_per_frame)
     (path / "frame000002/cam_2.png").unlink()
     capture = load_capture(path, reading=ReadConfig(gaps=True))
@@ -325,7 +313,7 @@ def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path: Pat
         load_capture(path)
 
 
-def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path) -> None:
+def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path):
     number = "9" * 60
     path = images(tmp_path / "c")
     (path / "cam_2" / "0003.png").rename(path / "cam_2" / f"{number}.png")
@@ -336,7 +324,7 @@ def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path) ->
         load_capture(path, reading=ReadConfig(gaps=True))
 
 
-def test_frames__stop_at_a_broken_image(tmp_path: Path) -> None:
+def test_frames__stop_at_a_broken_image(tmp_path):
     path = images(tmp_path / "c")
     (path / "cam_2" / "0002.png").write_bytes(b"")
     frames = load_capture(path).frames()

@@ -1,10 +1,5 @@
 """The command line in this process, and a capture and a stream to run it on."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from morgs_mi.cli.main import main
@@ -15,10 +10,10 @@ from tests.scenes.gaussians import isotropic
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def run(capsys):
     """`morgs-mi` with arguments; returns its status, standard output and standard error."""
 
-    def call(*args: object) -> tuple[int, str, str]:
+    def call(*args):
         status = main([str(a) for a in args])
         captured = capsys.readouterr()
         return status, captured.out, captured.err
@@ -27,13 +22,13 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Path:
+def capture(tmp_path):
     """Three cameras with moving noise."""
     return noise_capture.write_capture(tmp_path / "capture")
 
 
 @pytest.fixture
-def stream(tmp_path: Path) -> Path:
+def stream(tmp_path):
     """A stream of one splat in two frames."""
     path = tmp_path / "good.morgs"
     splat = isotropic([[0, 0, 0]], 0.3, 0.9, (1.0, 0, 0))

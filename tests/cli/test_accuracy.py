@@ -1,7 +1,5 @@
 """`morgs-mi accuracy`: table, plot and JSON of a file of Gaussians and of a stream."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -2,8 +2,6 @@
 them.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -16,7 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
@@ -36,7 +34,7 @@ FRAMES = 2
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Capture:
+def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording") / "spheres"
     synthesize(
         "spheres", folder, SynthConfig(cameras=CAMERAS, frames=FRAMES, width=320, height=240, spp=8)
@@ -44,7 +42,7 @@ def recording(tmp_path_factory) -> Capture:
     return load_capture(folder)
 
 
-def write_images(recording: Capture, name: str) -> None:
+def write_images(recording, name):
     """Write the images under names with {camera}, {frame} and {number}, which counts from 1."""
     for frame in recording.frames():
         for camera, image in zip(recording.names, frame.images, strict=True):
@@ -53,13 +51,13 @@ def write_images(recording: Capture, name: str) -> None:
             )
 
 
-def dynerf(recording: Capture) -> None:
+def dynerf(recording):
     write_images(recording, "dynerf/SCENE/{camera}/images/{frame:04d}.png")
     bounds = np.tile([1.0, 9.0], (CAMERAS, 1))
     write_poses_bounds("dynerf/SCENE/poses_bounds.npy", recording.cameras, bounds)
 
 
-def multipleview(recording: Capture) -> None:
+def multipleview(recording):
     write_images(recording, "multipleview/SCENE/{camera}/frame_{number:05d}.png")
     # As 4DGaussians' script names them: in no particular order.
     other = [
@@ -69,11 +67,11 @@ def multipleview(recording: Capture) -> None:
     write_colmap("multipleview/SCENE/sparse_", other, recording.points)
 
 
-def dynamic3dgs(_: Capture) -> None:
+def dynamic3dgs(_):
     layouts.dynamic3dgs(Path("dynamic3dgs/SCENE"))
 
 
-def stream3dgs(recording: Capture) -> None:
+def stream3dgs(recording):
     write_images(recording, "3dgstream/SCENE/frame{frame:06d}/images/{camera}.png")
     for frame in range(FRAMES):
         write_colmap(
@@ -81,7 +79,7 @@ def stream3dgs(recording: Capture) -> None:
         )
 
 
-def nerfstudio(recording: Capture) -> None:
+def nerfstudio(recording):
     first = next(iter(recording.frames()))
     cameras = []
     for i, (camera, image) in enumerate(zip(recording.cameras, first.images, strict=True), start=1):
@@ -91,7 +89,7 @@ def nerfstudio(recording: Capture) -> None:
     layouts.transforms(Path("nerfstudio/SCENE"), cameras)
 
 
-def vggt(recording: Capture) -> None:
+def vggt(recording):
     """Photos, and a binary model in `sparse` itself."""
     first = next(iter(recording.frames()))
     for camera, image in zip(recording.cameras, first.images, strict=True):

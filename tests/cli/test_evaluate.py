@@ -1,7 +1,5 @@
 """`morgs-mi eval`: its files."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

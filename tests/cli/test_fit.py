@@ -1,14 +1,11 @@
 """`morgs-mi fit`: options, interruption, a full disk, and continuing."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import astuple, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
@@ -25,7 +21,7 @@ from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.cluster.chunks import ChunkedRun
-from morgs_mi.runs.cluster.tasks import ChunkConfig, Part
+from morgs_mi.runs.cluster.tasks import ChunkConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.quick import OPTIONS
@@ -86,11 +82,11 @@ def test_fit__and_eval_use_the_same_timestamps(capture, tmp_path, run):
     assert (result["complete"], result["num_frames"]) == (True, 2)
 
 
-def before_frame_2(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) -> None:
+def before_frame_2(monkeypatch, action):
     """Call `action` before frame 2 is fitted."""
     push = StreamLoop.push
 
-    def acting_push(loop: StreamLoop, *args: object) -> object:
+    def acting_push(loop, *args):
         if loop.state.frame == 2:
             action()
         return push(loop, *args)
@@ -180,13 +176,11 @@ def test_fit__takes_the_held_out_camera_by_index_or_name(
     )
 
 
-def fitted_capture(
-    monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Path, *args: object
-) -> Capture:
+def fitted_capture(monkeypatch, run, capture, out, *args):
     """Return the capture that `morgs-mi fit` passes on."""
-    passed: list[Capture] = []
+    passed = []
 
-    def stop(capture: Capture, *_: object) -> None:
+    def stop(capture, *_):
         passed.append(capture)
         raise KeyboardInterrupt
 
@@ -210,7 +204,7 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path, run, monkeypatch):
     )
 
 
-def clean_up(*_: object) -> None:
+def clean_up(*_):
     """Do what a library may make of an interruption."""
     try:
         raise KeyboardInterrupt
@@ -322,7 +316,7 @@ def test_fit__fits_chunks_side_by_side_and_names_what_stands_when_interrupted(
     out = tmp_path / "out"
     add = ChunkedRun.add_part
 
-    def add_and_stop(fit: ChunkedRun, part: Part) -> None:
+    def add_and_stop(fit, part):
         add(fit, part)
         raise KeyboardInterrupt
 

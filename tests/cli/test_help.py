@@ -1,7 +1,5 @@
 """`morgs-mi --version`, completion of a shell, and commands and presets that are listed."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -2,14 +2,11 @@
 each.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import pytest
@@ -100,7 +97,7 @@ def test_main__runs_as_a_module():
     assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
 
 
-def writing_commands(capture: Path, stream: Path, place: Path) -> list[tuple]:
+def writing_commands(capture, stream, place):
     """Return commands that write into a folder."""
     size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
     return [
@@ -167,7 +164,7 @@ def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
 
 
 def test_main__is_interrupted_while_the_variant_is_set(capture, run, monkeypatch):
-    def interrupted(*_: object) -> None:
+    def interrupted(*_):
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt as error:
@@ -178,7 +175,7 @@ def test_main__is_interrupted_while_the_variant_is_set(capture, run, monkeypatch
 
 
 def test_main__reports_an_unexpected_error_in_one_sentence(capture, run, monkeypatch):
-    def fail(*_: object, **__: object) -> None:
+    def fail(*_, **__):
         raise AttributeError("'NoneType' object has no attribute 'a'")
 
     monkeypatch.setattr("morgs_mi.extras.calibration.command.load_capture", fail)

@@ -2,8 +2,6 @@
 steps.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
@@ -34,7 +32,7 @@ PAGES = ("README.md", *(f"docs/{name}.md" for name in GUIDES))
 LEFT_OUT = ("morgs-mi view", "morgs-mi --tyro-write-completion")
 
 
-def commands(page: str) -> list[str]:
+def commands(page):
     """Return the commands of a page, without comments."""
     lines = re.findall(
         r"^    (morgs-mi .*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE
@@ -43,7 +41,7 @@ def commands(page: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(tmp_path_factory):
     """A folder with what stands for the names in capitals: a capture, its first images, and the
     clips alone.
     """

@@ -2,8 +2,6 @@
 of these.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -21,7 +19,7 @@ FRAMES = 3
 SMALLER = "--num-gaussians 2500 --first-frame-steps 200 --epochs 1"
 
 
-def stand_in(path: Path, width: int, height: int, number: str) -> None:
+def stand_in(path, width, height, number):
     """Write videos with camera numbers in this format, and `poses_bounds.npy`, as these recordings
     have them.
     """

@@ -4,8 +4,6 @@ folder that holds them.
 MORGS_MI_RECORDINGS=FOLDER pytest -m slow tests/cli/test_recordings.py
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`morgs-mi render`: bad input, and outputs that could not be finished."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

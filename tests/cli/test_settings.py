@@ -1,12 +1,10 @@
 """Settings of a fit: presets, files, options and their order."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import asdict
 from functools import reduce
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import pytest
 
@@ -18,7 +16,7 @@ from morgs_mi.extras.live.live_config import LIVE_STREAM
 from morgs_mi.loop.stream_config import StreamConfig
 
 
-def printed_config(run, *args: object) -> StreamConfig:
+def printed_config(run, *args):
     status, text, error = run("fit", *args, "--print-config")
     assert (status, error) == (0, "")
     return apply_values(StreamConfig(), tomllib.loads(text))
@@ -87,7 +85,7 @@ def test_fit__prints_a_config_that_it_reads_back(tmp_path, run, args):
         assert {key for key in values if values[key] != default[key]} == set(SETTINGS.values())
 
 
-def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(values, prefix=""):
     pairs = [
         flattened(value, f"{prefix}{name}.")
         if isinstance(value, dict)

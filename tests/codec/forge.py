@@ -7,17 +7,15 @@ from __future__ import annotations
 import copy
 import json
 import struct
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.codec.container import PAYLOAD, PREAMBLE, Packet, PacketKind, decode_packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from tests.scenes.coded_clip import CAMERAS, cloud
-from tests.scenes.short_clip import Clip, Piece, sealed
+from tests.scenes.short_clip import sealed
 
 HOSTILE_TEXT = (
     "NaN",
@@ -94,7 +92,7 @@ DTYPES = (
 )
 
 
-def damaged(clip: Clip, rng: np.random.Generator) -> bytes:
+def damaged(clip, rng):
     """Return the stream truncated, with flipped bits, or with an overwritten range."""
     data = clip.data
     spoilt = bytearray(data)
@@ -113,7 +111,7 @@ def damaged(clip: Clip, rng: np.random.Generator) -> bytes:
     return bytes(spoilt)
 
 
-def with_forged_bytes(clip: Clip, rng: np.random.Generator) -> bytes:
+def with_forged_bytes(clip, rng):
     """Change up to three bytes inside one packet."""
     piece = clip.pieces[rng.integers(2, len(clip.pieces))]
     spoilt = bytearray(clip.data[piece.start + PAYLOAD : piece.stop])
@@ -126,7 +124,7 @@ def with_forged_bytes(clip: Clip, rng: np.random.Generator) -> bytes:
     return clip.data[: piece.start] + packet + clip.data[piece.stop :]
 
 
-def with_forged_packets(clip: Clip, rng: np.random.Generator) -> bytes:
+def with_forged_packets(clip, rng):
     """Change numbers, tables, codes, kinds, frames and the order of packets; half of the time the
     parents fit again.
     """
@@ -140,7 +138,7 @@ def with_forged_packets(clip: Clip, rng: np.random.Generator) -> bytes:
     return header + b"".join(packet.sealed() for packet in packets)
 
 
-def with_forged_header(clip: Clip, rng: np.random.Generator) -> bytes:
+def with_forged_header(clip, rng):
     """Replace, remove or add entries of the header."""
     header = json.loads(clip.data[clip.pieces[1].start + PAYLOAD : clip.pieces[1].stop])
     marks = []
@@ -159,7 +157,7 @@ def with_forged_header(clip: Clip, rng: np.random.Generator) -> bytes:
     return clip.data[: PREAMBLE.size] + packet + clip.data[clip.pieces[1].stop :]
 
 
-def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
+def forged_streams(clip):
     """Return the stream with another keyframe of frame 3, and with an index that has no keyframe as
     its second entry.
 
@@ -177,7 +175,7 @@ def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
     )
 
 
-def _nodes(value: Any) -> list[Any]:
+def _nodes(value):
     """Return all objects and lists in a JSON value."""
     children = (
         value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
@@ -187,7 +185,7 @@ def _nodes(value: Any) -> list[Any]:
     )
 
 
-def _any(choices: Sequence[Any], rng: np.random.Generator) -> Any:
+def _any(choices, rng):
     return choices[rng.integers(len(choices))]
 
 
@@ -210,16 +208,16 @@ class Draft:
     index: bytes = b""
 
     @classmethod
-    def of(cls, clip: Clip, piece: Piece) -> Draft:
+    def of(cls, clip, piece):
         if piece.kind == 3:
             return cls(piece.kind, piece.frame, index=clip.data[piece.start + PAYLOAD : piece.stop])
         arrays = decode_packet(clip.data[piece.start : piece.stop]).arrays
         return cls(piece.kind, piece.frame, {name: array.copy() for name, array in arrays.items()})
 
-    def rows(self) -> list[Any]:
+    def rows(self):
         return [[name, array.dtype.name, list(array.shape)] for name, array in self.arrays.items()]
 
-    def sealed(self) -> bytes:
+    def sealed(self):
         table = (self.table or json.dumps(self.rows())).encode("latin1")
         arrays = b"".join(array.tobytes() for array in self.arrays.values())
         return sealed(
@@ -227,11 +225,11 @@ class Draft:
         )
 
 
-def _with_arrays(packets: list[Draft], rng: np.random.Generator) -> Draft:
+def _with_arrays(packets, rng):
     return _any([packet for packet in packets if packet.arrays], rng)
 
 
-def _table(packets: list[Draft], rng: np.random.Generator) -> None:
+def _table(packets, rng):
     packet = _with_arrays(packets, rng)
     table = packet.rows()
     place = rng.integers(3)
@@ -250,12 +248,12 @@ def _table(packets: list[Draft], rng: np.random.Generator) -> None:
     packet.table = json.dumps(table).replace('"MARK"', _any(HOSTILE_TEXT, rng))
 
 
-def _head(packets: list[Draft], rng: np.random.Generator) -> None:
+def _head(packets, rng):
     head = _with_arrays(packets, rng).arrays["head"]
     head[rng.integers(len(head))] = _any(HOSTILE_NUMBERS, rng)
 
 
-def _code(packets: list[Draft], rng: np.random.Generator) -> None:
+def _code(packets, rng):
     """Replace the code by other words, of the same or another number."""
     arrays = _with_arrays(packets, rng).arrays
     words = arrays["code"]
@@ -271,7 +269,7 @@ def _code(packets: list[Draft], rng: np.random.Generator) -> None:
     arrays["code"] = words
 
 
-def _number(packets: list[Draft], rng: np.random.Generator) -> None:
+def _number(packets, rng):
     """Change the kind or the frame of a packet."""
     packet = _any(packets, rng)
     if rng.random() < 0.3:
@@ -280,7 +278,7 @@ def _number(packets: list[Draft], rng: np.random.Generator) -> None:
         packet.frame = _any((0, 1, 3, 5, 6, packet.frame + 1, 2**31, 2**32 - 1), rng) % 2**32
 
 
-def _order(packets: list[Draft], rng: np.random.Generator) -> None:
+def _order(packets, rng):
     """Drop, repeat or move a packet."""
     k, to = rng.integers(len(packets), size=2)
     packet = packets[k]
@@ -290,7 +288,7 @@ def _order(packets: list[Draft], rng: np.random.Generator) -> None:
         packets.insert(to, copy.deepcopy(packet))
 
 
-def _index(packets: list[Draft], rng: np.random.Generator) -> None:
+def _index(packets, rng):
     """Replace the index by one with other entries, which ends as it must."""
     numbers = [*HOSTILE_NUMBERS, 12, 600, 2**63, 2**64 - 1]
     entries = b"".join(
@@ -304,7 +302,7 @@ def _index(packets: list[Draft], rng: np.random.Generator) -> None:
     ]
 
 
-def _continue(packets: list[Draft]) -> None:
+def _continue(packets):
     """Replace the parents of residuals by the digests of the states before, as far as they can be
     decoded.
     """

@@ -7,8 +7,6 @@ library, at once and without an exception (glibc exits with status 127 where it 
 the thread-local data of a library).
 """
 
-from __future__ import annotations
-
 import faulthandler
 import json
 import re
@@ -16,7 +14,6 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
-from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.player import has_confidence
 from morgs_mi.playback.stream_header import num_frames, open_stream_capture, render_config
@@ -35,7 +32,7 @@ from tests.codec.forge import (
     with_forged_header,
     with_forged_packets,
 )
-from tests.scenes.short_clip import FRAMES, Clip, short_clip
+from tests.scenes.short_clip import FRAMES, short_clip
 
 # What a stream of a few kB may take: far less than a damaged length or count may request. A thread
 # of a library that starts meanwhile reserves 64 MiB for its heap and 8 MiB for its stack (glibc).
@@ -49,13 +46,13 @@ PLACE = re.compile(
 )
 
 
-def check_sentence(path: Path, error: Exception) -> None:
+def check_sentence(path, error):
     """Check that an error is a sentence that names the file and the place."""
     assert str(error).startswith(f"{path}: "), error
     assert PLACE.search(str(error)), error
 
 
-def check_damage(clip: Clip, path: Path, rng: np.random.Generator) -> None:
+def check_damage(clip, path, rng):
     """Check that all damage is reported, and that every intact frame plays as it was."""
     data = damaged(clip, rng)
     path.write_bytes(data)
@@ -64,7 +61,7 @@ def check_damage(clip: Clip, path: Path, rng: np.random.Generator) -> None:
         check_readers(path)
 
 
-def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
+def check_intact_frames(clip, data, path):
     """Check the frames of a file that differs from the clip by damage without a right CRC."""
     intact = [
         data[piece.start : piece.stop] == clip.data[piece.start : piece.stop]
@@ -110,9 +107,9 @@ def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
                 assert not differs(StreamReader(path).seek(piece.frame + 1), clip)
 
 
-def playable(clip: Clip, intact: list[bool]) -> list[int]:
+def playable(clip, intact):
     """Return the playable frames; their packets are intact back to a keyframe."""
-    frames: list[int] = []
+    frames = []
     for piece, ok in zip(clip.pieces, intact, strict=True):
         has_base = bool(frames) and piece.frame in (frames[-1], frames[-1] + 1)
         if ok and piece.frame not in frames and (piece.kind == 1 or (piece.kind == 2 and has_base)):
@@ -120,7 +117,7 @@ def playable(clip: Clip, intact: list[bool]) -> list[int]:
     return frames
 
 
-def check_bytes(clip: Clip, path: Path, rng: np.random.Generator) -> None:
+def check_bytes(clip, path, rng):
     """Check that a forged packet affects its own frame at most: the next residual refuses another
     state.
     """
@@ -131,18 +128,13 @@ def check_bytes(clip: Clip, path: Path, rng: np.random.Generator) -> None:
     check_readers(path)
 
 
-def check_forged(
-    forge: Callable[[Clip, np.random.Generator], bytes],
-    clip: Clip,
-    path: Path,
-    rng: np.random.Generator,
-) -> None:
+def check_forged(forge, clip, path, rng):
     """Check the readers of a forged stream."""
     path.write_bytes(forge(clip, rng))
     check_readers(path)
 
 
-def check_readers(path: Path) -> None:
+def check_readers(path):
     """Check that a file plays and can be sought, also without its damage, or is refused by
     sentences with the place.
     """
@@ -172,7 +164,7 @@ def check_readers(path: Path) -> None:
             pass
 
 
-def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
+def check_seek(stream, played):
     """Check that frames that play can be sought: one in the middle and the last.
 
     A reader that starts at a keyframe has nothing to compare it with: what it finds may differ from
@@ -187,9 +179,9 @@ def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
             assert np.array_equal(decoded_state.digest, state.digest), state.frame
 
 
-def play(path: Path) -> tuple[list[CodedFrame], ValueError | None]:
+def play(path):
     """Return the frames that a reader decodes from the start, and the error that ends it."""
-    played: list[CodedFrame] = []
+    played = []
     try:
         played.extend(coded_frames(StreamReader(path)))
     except ValueError as error:
@@ -197,12 +189,12 @@ def play(path: Path) -> tuple[list[CodedFrame], ValueError | None]:
     return played, None
 
 
-def differs(state: CodedFrame, clip: Clip) -> bool:
+def differs(state, clip):
     expected = clip.states.get(state.frame)
     return expected is None or not np.array_equal(state.digest, expected.digest)
 
 
-FUZZERS: dict[str, Callable[[Clip, Path, np.random.Generator], None]] = {
+FUZZERS = {
     "damage": check_damage,
     "bytes": check_bytes,
     "packets": partial(check_forged, with_forged_packets),
@@ -210,14 +202,14 @@ FUZZERS: dict[str, Callable[[Clip, Path, np.random.Generator], None]] = {
 }
 
 
-def limit_memory() -> None:
+def limit_memory():
     """Limit the address space to what it has now and what a case may take."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + MEMORY_BYTES + THREADS * THREAD_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
 
 
-def run(name: str, clip: Clip, seconds: float) -> dict[str, int]:
+def run(name, clip, seconds):
     """Run a fuzzer and return its number of streams.
 
     Raises:
@@ -240,7 +232,7 @@ def run(name: str, clip: Clip, seconds: float) -> dict[str, int]:
     return {"streams": case}
 
 
-def main(seconds: str, *names: str) -> None:
+def main(seconds, *names):
     """Run fuzzers for some seconds each and print the results."""
     mi.set_variant("llvm_ad_rgb")
     faulthandler.enable()

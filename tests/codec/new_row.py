@@ -24,7 +24,7 @@ class LabelledGaussians(gaussians.Gaussians):
     logit_labels: Any = None
 
 
-def add_row() -> None:
+def add_row():
     """Add the row and the field, and forget the modules that were imported without them."""
     attributes.ATTRIBUTES = gaussians.ATTRIBUTES = (*attributes.ATTRIBUTES, ROW)
     attributes.BY_NAME[ROW.name] = attributes.BY_ACTIVATED_NAME[ROW.activated_name] = ROW
@@ -33,17 +33,17 @@ def add_row() -> None:
         del sys.modules[name]
 
 
-def check_round_trip(confidence: bool) -> None:
+def check_round_trip(confidence):
     """Check the decoded attributes of labelled Gaussians of which some change, die and are born."""
     from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
     from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
     rng = np.random.default_rng(0)
 
-    def labelled(base: Any) -> Any:
+    def labelled(base):
         return LabelledGaussians(**base.items(), logit_labels=rng.normal(0, 1, (len(base), 2)))
 
-    def error(value: Any, true: Any) -> float:
+    def error(value, true):
         return float(np.abs(np.asarray(value.labels) - np.asarray(true.labels)).max())
 
     first = labelled(cloud(50, confidence=confidence))
@@ -66,7 +66,7 @@ def check_round_trip(confidence: bool) -> None:
     assert (new_state.gaussians.logit_confidence is None) == (not confidence)
 
 
-def main() -> None:
+def main():
     """Check the new row and print the digest of a stream without labels."""
     mi.set_variant("llvm_ad_rgb")
     add_row()

@@ -2,8 +2,6 @@
 package's code.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

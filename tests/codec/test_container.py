@@ -1,12 +1,9 @@
 """The stream file: exact round trips, and detection of every damage."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,12 +37,12 @@ PACKETS = [
 METADATA = {"seed": 3, "parent": "äé", "preset": {"epochs": [1, 2.5, None]}}
 
 
-def cameras() -> list[Camera]:
+def cameras():
     view = replace(Camera.look_at((1, 2, 3), (0, 0, 0), (0, 0, 1), 55, 40, 30, "cam00"), near=0.2)
     return [view, Camera(view.K + np.diag([1, 1, 0]) / 3, view.viewmat, 41, 31, "cam01")]
 
 
-def write(path: Path, packets: list[Packet] = PACKETS) -> list[int]:
+def write(path, packets=PACKETS):
     """Write a stream and return its length after the header and after each packet."""
     with StreamWriter(path, cameras(), 29.97, METADATA) as stream:
         ends = [stream.num_bytes]
@@ -55,7 +52,7 @@ def write(path: Path, packets: list[Packet] = PACKETS) -> list[int]:
     return ends
 
 
-def assert_equal(got: Packet, expected: Packet) -> None:
+def assert_equal(got, expected):
     assert (got.kind, got.frame, list(got.arrays)) == (
         expected.kind,
         expected.frame,
@@ -128,7 +125,7 @@ def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path):
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
         intact = sum(end <= length for end in ends)
-        got: list[Packet] = []
+        got = []
         if length in ends:
             got.extend(StreamReader(path))
         else:
@@ -151,7 +148,7 @@ def test_stream_reader__detects_every_flipped_bit(tmp_path):
             list(StreamReader(path))
 
 
-def with_table(table: bytes, rest: bytes = b"") -> bytes:
+def with_table(table, rest=b""):
     return sealed(struct.pack("<I", len(table)) + table + rest)
 
 

@@ -2,8 +2,6 @@
 number is trusted.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -21,18 +19,18 @@ from morgs_mi.codec.reader import StreamReader
 from tests.codec.forge import forged_streams
 from tests.codec.fuzz import FUZZERS, differs
 from tests.scenes.coded_clip import cloud
-from tests.scenes.short_clip import FRAMES, Clip, short_clip
+from tests.scenes.short_clip import FRAMES, short_clip
 
 FUZZ_SECONDS = float(os.environ.get("MORGS_FUZZ_SECONDS", "600"))
 """Time that `make test-slow` spends on each fuzzer."""
 
 
 @pytest.fixture(scope="module")
-def clip() -> Clip:
+def clip():
     return short_clip()
 
 
-def fuzz(seconds: float, *names: str) -> None:
+def fuzz(seconds, *names):
     """Run fuzzers in a process of their own and check that it ends well."""
     single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     command = [sys.executable, "-m", "tests.codec.fuzz", str(seconds), *names]
@@ -54,7 +52,7 @@ def test_readers__survive_minutes_of_damaged_and_forged_streams(name):
     fuzz(FUZZ_SECONDS, name)
 
 
-def flipped(clip: Clip, *frames: int, kind: int = 2) -> bytes:
+def flipped(clip, *frames, kind=2):
     """Return the clip with a flipped bit in the packets of a kind of some frames."""
     data = bytearray(clip.data)
     for piece in clip.pieces:
@@ -131,7 +129,7 @@ def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip
             assert not differs(stream.seek(state.frame), clip)
 
 
-def constant(N: int, degree: int) -> CodedFrame:
+def constant(N, degree):
     """Return N equal Gaussians, which an entropy code stores in almost no bytes."""
     C = 10 + 3 * (degree + 1) ** 2
     grid = Grid(

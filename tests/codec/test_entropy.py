@@ -1,7 +1,5 @@
 """Entropy coding: exact, close to the entropy, and harmless when damaged."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np
@@ -23,7 +21,7 @@ COLUMNS = {
 }
 
 
-def coded(*columns: np.ndarray) -> np.ndarray:
+def coded(*columns):
     writer = ColumnWriter()
     for column in columns:
         writer.put(column)

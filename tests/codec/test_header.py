@@ -1,10 +1,7 @@
 """The header: types and ranges of every entry are checked, by readers and by writers."""
 
-from __future__ import annotations
-
 import json
 import re
-from typing import Any
 
 import pytest
 
@@ -15,11 +12,11 @@ from tests.scenes.coded_clip import CAMERAS
 SOUND = json.loads(header_json(CAMERAS, 25, {"seed": 1}))
 
 
-def with_entry(path: str, text: str) -> bytes:
+def with_entry(path, text):
     """Return the JSON of a header with one entry replaced, or removed if `text` is empty."""
     header = json.loads(json.dumps(SOUND))
     *parents, last = (int(part) if part.isdecimal() else part for part in path.split("."))
-    node: Any = header
+    node = header
     for part in parents:
         node = node[part]
     node[last] = "REPLACED"

@@ -5,13 +5,10 @@ it wrote it: births, a death, offsets, confidences and a re-emitted keyframe. Ne
 again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ STREAMS = Path(__file__).parent / "streams"
 PROMISES = (Path(__file__).parents[2] / "docs" / "promises.md").read_text(encoding="utf-8")
 
 
-def summary(path: Path) -> list[dict[str, Any]]:
+def summary(path):
     """Return the number of Gaussians and hashes of the integers and of the decoded numbers of each
     frame.
     """

@@ -1,7 +1,5 @@
 """Frames in the stream: bit-exact states, stable ids, and packets that are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -70,7 +68,7 @@ def test_decode__ids_follow_a_gaussian_from_birth_to_death():
     assert decode(None, reemitted_keyframe(state)).ids.tolist() == [2, 5, 7, 8]
 
 
-def single_at(x: float) -> Gaussians:
+def single_at(x):
     single = decode(None, keyframe_packet(cloud(1), 0)).gaussians
     return replace(single, means=[[x, 0, 0]])
 
@@ -92,11 +90,11 @@ def test_residual_packet__removes_all_gaussians():
     assert (new_state.ids.tolist(), new_state.next_id) == ([5], 6)
 
 
-def with_head(packet: Packet, *head: int) -> Packet:
+def with_head(packet, *head):
     return with_array(packet, "head", np.array(head, np.uint32))
 
 
-def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
+def with_array(packet, name, array):
     return Packet(packet.kind, packet.frame, {**packet.arrays, name: array})
 
 

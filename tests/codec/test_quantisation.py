@@ -1,7 +1,5 @@
 """Steps of the quantised numbers: bounded errors, extremes, and the bytes that they take."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,19 +1,15 @@
 """Reading a stream: in order, from a frame on, from a pipe, and on any number of threads."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
 import sys
 import threading
-from typing import BinaryIO
 
 import pytest
 
 from morgs_mi.codec.container import StreamWriter, TruncatedStreamError
 from morgs_mi.codec.packets import (
-    CodedFrame,
     coded_frames,
 )
 from morgs_mi.codec.reader import StreamReader
@@ -39,7 +35,7 @@ def test_seek__equals_playing_with_and_without_an_index(tmp_path):
         StreamReader(path).seek(14)
 
 
-def tcp() -> tuple[BinaryIO, BinaryIO]:
+def tcp():
     with socket.create_server(("127.0.0.1", 0)) as server:
         sender = socket.create_connection(server.getsockname())
         receiver, _ = server.accept()
@@ -50,10 +46,10 @@ def tcp() -> tuple[BinaryIO, BinaryIO]:
 def test_stream_reader__receives_frames_while_they_are_written():
     packets, states = encoded_clip(5)
     source, sink = tcp()
-    got: list[CodedFrame] = []
+    got = []
     arrived = threading.Semaphore(0)
 
-    def receive() -> None:
+    def receive():
         with source:
             for state in coded_frames(StreamReader(source)):
                 got.append(state)

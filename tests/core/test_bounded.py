@@ -1,14 +1,10 @@
 """Files with headers that claim too much are refused before memory is allocated."""
 
-from __future__ import annotations
-
 import os
 import struct
 import tracemalloc
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +18,7 @@ from morgs_mi.io.video import FolderReader
 
 
 @pytest.fixture(autouse=True)
-def bounded_memory() -> Iterator[None]:
+def bounded_memory():
     """Check that no test allocates more than small files may take."""
     tracemalloc.start()
     yield
@@ -31,36 +27,36 @@ def bounded_memory() -> Iterator[None]:
     assert peak < 250e6
 
 
-def archived(path: Path) -> np.ndarray:
+def archived(path):
     return read_array(path, "data")
 
 
-def image(path: Path) -> FolderReader:
+def image(path):
     return FolderReader.of_files([path])
 
 
-def npy(shape: str, dtype: str = "'<f8'", body: bytes = bytes(48)) -> bytes:
+def npy(shape, dtype="'<f8'", body=bytes(48)):
     """Return a NumPy file with any header."""
     return npy_header(f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}\n", body)
 
 
-def npy_header(header: str, body: bytes = b"") -> bytes:
+def npy_header(header, body=b""):
     return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode() + body
 
 
-def npz(member: bytes, name: str = "data.npy") -> Callable[[Path], object]:
-    def write(path: Path) -> None:
+def npz(member, name="data.npy"):
+    def write(path):
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(name, member)
 
     return write
 
 
-def ply(header: str, body: bytes = b"") -> bytes:
+def ply(header, body=b""):
     return b"ply\n" + header.encode() + b"end_header\n" + body
 
 
-def png(width: int, height: int) -> bytes:
+def png(width, height):
     header = struct.pack(">4sIIBBBBB", b"IHDR", width, height, 8, 2, 0, 0, 0)
     return (
         b"\x89PNG\r\n\x1a\n"
@@ -71,7 +67,7 @@ def png(width: int, height: int) -> bytes:
     )
 
 
-def large_exr(path: Path) -> None:
+def large_exr(path):
     write_exr(path, {"a": np.zeros((5, 7))})
     window = b"box2i\0" + struct.pack("<I4i", 16, 0, 0, 6, 4)
     claim = b"box2i\0" + struct.pack("<I4i", 16, 0, 0, 39999, 39999)

@@ -1,7 +1,5 @@
 """The camera, against Mitsuba's own sensor, central differences and its own inverse."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba as mi
@@ -15,7 +13,7 @@ from morgs_mi.testing import assert_close
 @pytest.fixture(
     params=[(0.0, 0.0), (9.0, -6.0), (-5.5, 7.25)], ids=["centred", "right_up", "left_down"]
 )
-def camera(request) -> Camera:
+def camera(request):
     camera = Camera.look_at((0.3, 0.5, 4), (0, 0, 0), (0, 1, 0), 40, 64, 48, "cam00")
     K = camera.K.copy()
     K[:2, 2] += request.param

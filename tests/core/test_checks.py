@@ -1,7 +1,5 @@
 """Checks of arguments: what they accept, and the sentences with which they refuse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The transfer curve: closed form, inverse, slope and extremes, in NumPy and in Dr.Jit."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

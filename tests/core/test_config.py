@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import asdict, field
 from math import nan
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ class Leaf:
     """Limit; None: no limit."""
     mode: Literal["fast", "exact"] | None = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         if self.count < 0:
             raise ValueError(f"Leaf(): `count` must not be negative, got {self.count}; take 0.")
 
@@ -119,7 +119,7 @@ def test_config_toml__has_every_setting_with_its_docstring():
     text = config_toml(StreamConfig())
     tables = tomllib.loads(text)
 
-    def settings(config: dict[str, Any]) -> dict[str, Any]:
+    def settings(config):
         return {
             name: settings(value) if isinstance(value, dict) else None
             for name, value in config.items()

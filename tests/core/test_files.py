@@ -1,7 +1,5 @@
 """Atomic creation of files and folders, and locked folders."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -14,7 +12,7 @@ from morgs_mi.core.files import atomic_folder, atomic_path, locked_folder, write
 from tests.scenes.full_disk import files_end_at
 
 
-def tree(path: Path) -> dict[str, bytes | None]:
+def tree(path):
     """Return the content of every file below `path` by its name, hidden ones too, and None for
     folders.
     """
@@ -24,7 +22,7 @@ def tree(path: Path) -> dict[str, bytes | None]:
     }
 
 
-def write(partial: Path, kind: str, text: str = "new") -> None:
+def write(partial, kind, text="new"):
     """Write a file, or a folder with a file in it."""
     if kind == "folder":
         partial.mkdir()
@@ -58,7 +56,7 @@ def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path, kind, ol
         write(tmp_path / "x", kind, "old")
     old_tree = tree(tmp_path)
 
-    def fail() -> None:
+    def fail():
         with atomic_path(tmp_path / "x", "test()") as partial:
             write(partial, kind)
             raise error
@@ -105,7 +103,7 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(tmp_path, monk
     write(tmp_path / "x", "folder", "old")
     old_tree = tree(tmp_path)
 
-    def failing(*_: Path) -> None:
+    def failing(*_):
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(Path, "replace", failing)

@@ -1,7 +1,5 @@
 """Gaussians: parameters of the attribute table, and the parts of the spherical harmonics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
@@ -14,7 +12,7 @@ from morgs_mi.core.gaussians import Gaussians, join_sh, split_sh
 from tests.scenes.gaussians import make_scene, to_gaussians
 
 
-def cloud(degree: int) -> Gaussians:
+def cloud(degree):
     return to_gaussians(make_scene(degree, n=5))
 
 

@@ -2,8 +2,6 @@
 renderer.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +18,7 @@ from tests import reference
 R = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 
 
-def cloud(N: int = 30, degree: int = 3) -> Gaussians:
+def cloud(N=30, degree=3):
     rng = np.random.default_rng(degree)
     return Gaussians(
         rng.uniform(-1, 1, (N, 3)),

@@ -2,8 +2,6 @@
 without memory left.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -16,7 +14,7 @@ import pytest
 from morgs_mi.core.interrupts import interruptible, interrupts_raised, is_interruption, postponed
 
 
-def chained(kind: type[Exception], explicit: bool) -> BaseException:
+def chained(kind, explicit):
     """Return an error that was raised because of, or while handling, an interruption."""
     try:
         try:
@@ -55,9 +53,9 @@ class Thing:
 
 
 def test_interrupts_raised__releases_the_variables_of_what_was_interrupted():
-    references: list[weakref.ref[Thing]] = []
+    references = []
 
-    def interrupted() -> None:
+    def interrupted():
         thing = Thing()
         cycle = []
         cycle.append((cycle, thing))
@@ -80,15 +78,15 @@ def test_interrupts_raised__leaves_other_errors_as_they_are():
 class Swallowing:
     """An object that is interrupted where Python ignores every error."""
 
-    def __del__(self) -> None:
+    def __del__(self):
         signal.raise_signal(signal.SIGINT)
 
 
-def plainly() -> None:
+def plainly():
     signal.raise_signal(signal.SIGTERM)
 
 
-def in_a_destructor() -> None:
+def in_a_destructor():
     Swallowing()
 
 
@@ -96,7 +94,7 @@ def in_a_destructor() -> None:
 def test_interruptible__raises_once_for_each_signal(heeds_interrupts, interrupt):
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 
-    def wait() -> None:
+    def wait():
         with interruptible():
             interrupt()
             time.sleep(10)
@@ -116,7 +114,7 @@ def test_interruptible__raises_what_was_swallowed_at_the_end(heeds_interrupts):
 def test_postponed__raises_at_its_end(heeds_interrupts):
     stages = []
 
-    def interrupted() -> None:
+    def interrupted():
         with postponed():
             plainly()
             stages.append("done")

@@ -2,8 +2,6 @@
 of a crash.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
@@ -23,7 +21,7 @@ pytestmark = linux
 def libraries(tmp_path):
     """Return a function that puts empty files of the given names into a folder."""
 
-    def make(*names: str) -> list[Path]:
+    def make(*names):
         for name in names:
             (tmp_path / name).touch()
         return [tmp_path]

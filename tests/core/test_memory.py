@@ -1,7 +1,5 @@
 """Copies of NumPy memory for Dr.Jit: types and alignment. Memory that is free."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -85,7 +83,7 @@ def test_check_memory__names_what_is_needed_and_free(monkeypatch):
         check_memory("f()", 2.1e9, "an image", "make it smaller")
 
 
-def wide(width: int) -> Camera:
+def wide(width):
     return Camera.look_at((0, 0, -5), (0, 0, 0), (0, -1, 0), 40, width, width)
 
 

@@ -1,7 +1,5 @@
 """Progress bars in notebooks, on terminals and elsewhere."""
 
-from __future__ import annotations
-
 import io
 import sys
 from types import SimpleNamespace
@@ -13,7 +11,7 @@ from morgs_mi.core.progress import Progress, ProgressBar
 
 
 class Terminal(io.StringIO):
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
@@ -48,7 +46,7 @@ def test_progress_bar__writes_nothing_into_a_file(monkeypatch):
 
 def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
     display = pytest.importorskip("IPython.display", reason="comes with the extra `notebooks`")
-    shown: list[str] = []
+    shown = []
 
     def show(content, display_id):
         assert display_id

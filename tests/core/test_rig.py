@@ -1,13 +1,10 @@
 """Near planes that follow the scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import check_near_planes, scene_extent, with_near_planes
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import arc, circle, look_at_cameras
@@ -15,13 +12,13 @@ from tests.scenes.cameras import arc, circle, look_at_cameras
 NO_POINTS = np.zeros((0, 3))
 
 
-def slab() -> np.ndarray:
+def slab():
     """Return points [500, 3] at depths 2 to 3 of a camera at z = -3 that looks along +z."""
     rng = np.random.default_rng(0)
     return rng.uniform((-0.5, -0.4, -1), (0.5, 0.4, 0), (500, 3))
 
 
-def nears(cameras: list[Camera], points: np.ndarray = NO_POINTS) -> np.ndarray:
+def nears(cameras, points=NO_POINTS):
     return np.array([camera.near for camera in with_near_planes(cameras, points)])
 
 

@@ -1,7 +1,5 @@
 """Work in threads."""
 
-from __future__ import annotations
-
 import pytest
 
 from morgs_mi.core.threads import map_in_threads

@@ -1,7 +1,5 @@
 """Error against run time of the renderer, compared with a reference in float64."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Evaluation of streams of recordings that were rendered from the same Gaussians."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Metrics compared with their definitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
@@ -21,13 +19,13 @@ TRUTH = rng.random((24, 31, 3))
 NOISY = np.clip(TRUTH + rng.normal(0, 0.1, TRUTH.shape), 0, 1)
 
 
-def ssim_by_windows(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def ssim_by_windows(image, truth):
     """SSIM of one channel in every window, as the paper writes it."""
     i = np.arange(-5, 6)
     w = np.exp(-(i[:, None] ** 2 + i**2) / (2 * 1.5**2))
     x, y = (sliding_window_view(each, (11, 11)) for each in (image, truth))
 
-    def mean(values: np.ndarray) -> np.ndarray:
+    def mean(values):
         return (values * w).sum((2, 3), keepdims=True) / w.sum()
 
     mx = mean(x)

@@ -1,7 +1,5 @@
 """3D motion: assignment to objects, motion of objects, comparison of displacements."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import numpy as np
@@ -26,7 +24,7 @@ TURN = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
 SHIFT = np.array([0.05, 0, -0.02])
 
 
-def plane(depth: float, left: int, right: int) -> GroundTruth:
+def plane(depth, left, right):
     """Ground truth of a wall: object `left` in the left half of the image, `right` in the right
     half.
     """

@@ -1,26 +1,21 @@
 """Tables of an evaluation: they fit a terminal and hold the figures."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from rich.console import Console
 
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables, figure
 from tests.scenes.moving_splats import write_stream
 
 
 @pytest.fixture(scope="module")
-def result(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Evaluation:
+def result(fitted_clip, tmp_path_factory):
     path = tmp_path_factory.mktemp("tables") / "s.morgs"
     write_stream(path, {"test_view": 0}, shift=1)
     return evaluate_stream(path, fitted_clip / "capture")
 
 
-def text_of(result: Evaluation) -> str:
+def text_of(result):
     """Return the tables of an evaluation as printed."""
     console = Console(width=200, record=True)
     for table in evaluation_tables(result):

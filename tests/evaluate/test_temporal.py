@@ -1,7 +1,5 @@
 """Quality over time: variation of static pixels, recorded change, slope of a score."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,18 +1,14 @@
 """`morgs-mi info` for a capture."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.extras.calibration import command as info
 from morgs_mi.extras.calibration.timing import TimeOffsets
 from morgs_mi.io.video_writer import write_video
@@ -22,7 +18,7 @@ from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
 
 @pytest.mark.slow
 @pytest.mark.parametrize("option", ["--no-check", "--help"])
-def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -> None:
+def test_info__names_standard_output_if_it_is_full(capture, option):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "morgs_mi", "info", str(capture), option]
         result = subprocess.run(
@@ -31,7 +27,7 @@ def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -
     assert (result.returncode, result.stderr) == (1, "standard output: No space left on device.\n")
 
 
-def test_info__lists_the_cameras_of_a_capture(capture: Path, run) -> None:
+def test_info__lists_the_cameras_of_a_capture(capture, run):
     status, out, _ = run("info", capture, "--no-check")
     assert status == 0
     assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
@@ -41,9 +37,7 @@ def test_info__lists_the_cameras_of_a_capture(capture: Path, run) -> None:
 
 
 @pytest.mark.slow
-def test_info__prints_complete_columns_and_a_verdict_per_camera(
-    textured_capture: Capture, tmp_path: Path, run
-) -> None:
+def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture, tmp_path, run):
     path = tmp_path / ("capture of a rig in a folder with a long name" * 2)
     shutil.copytree(textured_capture.path, path)
     write_video(path / "cam1.mkv", [np.full((240, 320, 3), 128, np.uint8)], 30)
@@ -62,9 +56,7 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(
 
 
 @pytest.mark.slow
-def test_info__prints_the_check_and_draws_the_rig(
-    textured_capture: Capture, tmp_path: Path, run
-) -> None:
+def test_info__prints_the_check_and_draws_the_rig(textured_capture, tmp_path, run):
     path = textured_capture.path
     plot = tmp_path / "new" / "rig.png"
     times = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
@@ -80,9 +72,7 @@ def test_info__prints_the_check_and_draws_the_rig(
     assert_refused(refused, "the suffix of a plot must be .png, .jpg, .svg or .pdf, got '.gif'")
 
 
-def test_info__prints_the_time_offsets_as_options(
-    capture: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_info__prints_the_time_offsets_as_options(capture, run, monkeypatch):
     names = (*NAMES[:3], "other")
     offsets = dict(zip(names, (0.0, -0.254, 1.5, 0.7), strict=True))
     errors = dict(zip(names, (0.0, 0.023, 0.41, 1.0), strict=True))

@@ -1,16 +1,13 @@
 """Balance of cameras with different exposures, against the exposures applied to the images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, RenderConfig, rasterize
-from morgs_mi.core.camera import Camera
+from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
-from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
@@ -28,7 +25,7 @@ TONES = np.array([0.3, 0.5, 0.7])[:, None]
 FIT = FitConfig(exposure="auto", short_fits=ShortFitConfig(gaussians=400, steps=100, rounds=6))
 
 
-def scene() -> Gaussians:
+def scene():
     """A textured wall; all Gaussians are seen by all cameras."""
     rng = np.random.default_rng(0)
     return isotropic(
@@ -39,11 +36,11 @@ def scene() -> Gaussians:
     )
 
 
-def exposed(colors: np.ndarray, gain: float) -> np.ndarray:
+def exposed(colors, gain):
     return encode_light(np.clip(gain * decode_light(colors), 0, 1))
 
 
-def images(cameras: list[Camera], gains: np.ndarray) -> list[np.ndarray]:
+def images(cameras, gains):
     rendered = [np.asarray(rasterize(scene(), camera, ("color",)).color) for camera in cameras]
     return [
         np.rint(255 * exposed(image.clip(0, 1), g)).astype(np.uint8)
@@ -51,7 +48,7 @@ def images(cameras: list[Camera], gains: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def balanced(gains: np.ndarray, config: FitConfig = FIT, report: Report | None = None) -> Balance:
+def balanced(gains, config=FIT, report=None):
     start = replace(scene(), sh_coeffs=0.8 * scene().sh_coeffs)  # colours of points are about right
     views = tuple(View(*view) for view in zip(CAMERAS, images(CAMERAS, gains), strict=True))
     problem = FirstFrameProblem(start, views, np.zeros((0, 3)), scene_extent(CAMERAS), RENDER)
@@ -82,7 +79,7 @@ def test_balance_cameras__leaves_equal_cameras_alone_after_one_fit():
 
 
 @pytest.mark.slow
-def test_balance_cameras__judges_by_withheld_pixels(monkeypatch: pytest.MonkeyPatch):
+def test_balance_cameras__judges_by_withheld_pixels(monkeypatch):
     scores = iter((25.0, 25.05))
     monkeypatch.setattr("morgs_mi.fit.balance.mean_psnr", lambda *_: next(scores))
     balance = balanced(GAINS)

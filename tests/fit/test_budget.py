@@ -1,7 +1,5 @@
 """The plan of the first frame, by the factors of a reference machine."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +16,7 @@ DETAIL = DetailConfig(per_detail=100.0, least_gaussians=5_000, most_gaussians=50
 CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropout=0.0, density=DensityConfig(rounds=0))
 
 
-def planned(seconds: float, config: FitConfig = CONFIG) -> tuple[FitConfig, float | None]:
+def planned(seconds, config=CONFIG):
     views_of_ball = [
         View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)
     ]
@@ -27,7 +25,7 @@ def planned(seconds: float, config: FitConfig = CONFIG) -> tuple[FitConfig, floa
     )
 
 
-def numbers(plan: tuple[FitConfig, float | None]) -> tuple[int, int]:
+def numbers(plan):
     return plan[0].planned_gaussians, plan[0].planned_steps
 
 

@@ -1,7 +1,5 @@
 """Density control: which Gaussians are added and pruned, and their order."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Density control in a loop of one's own."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """The number of Gaussians from the detail of images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +16,7 @@ CONFIG = DetailConfig(per_detail=1.0, least_gaussians=10, most_gaussians=10**6)
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
 
 
-def texture(
-    width: int = 64, height: int = 48, cell: int = 4, amplitude: float = 80, noise: float = 0
-) -> np.ndarray:
+def texture(width=64, height=48, cell=4, amplitude=80, noise=0):
     """Return cells of random brightness with noise; both in 8-bit units."""
     rng = np.random.default_rng(1)
     cells = rng.uniform(-amplitude, amplitude, (height // cell, width // cell, 1))
@@ -52,9 +48,7 @@ def test_count_details__counts_valid_pixels_only():
     assert count_details(image, mask) == pytest.approx(count_details(image, None) / 2, rel=0.1)
 
 
-def count(
-    cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig = CONFIG
-) -> int | None:
+def count(cameras, image, points, config=CONFIG):
     """Return the number of Gaussians of views that all show one image."""
     fit_config = FitConfig(detail=config, first_frame_seconds=1e9)
     views = [View(camera, image) for camera in cameras]

@@ -1,7 +1,5 @@
 """Random dropout of Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
@@ -24,7 +22,7 @@ GAUSSIANS = isotropic(np.zeros((COUNT, 3)), 0.1, 0.3, np.zeros((COUNT, 1, 3)))
 
 
 @pytest.mark.parametrize("probability", [0.2, 0.5])
-def test_dropped__keeps_the_expected_opacity(probability: float):
+def test_dropped__keeps_the_expected_opacity(probability):
     opacities = np.asarray(dropped(GAUSSIANS, probability, np.random.default_rng(0)).opacities)
     mask = opacities > 1e-6
     assert mask.mean() == pytest.approx(1 - probability, abs=0.03)
@@ -53,7 +51,7 @@ def test_dropped__passes_gradients_to_the_kept_alone():
 def test_adapted_to_images__sets_a_dropout_for_few_views_that_are_noisy_or_far_apart():
     rng = np.random.default_rng(0)
 
-    def dropout(noise: float, degrees: float, times: int = 1) -> float:
+    def dropout(noise, degrees, times=1):
         noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in times * GREY]
         cameras = look_at_cameras(arc(np.deg2rad(degrees) * np.arange(len(noisy)), 3.5), 40)
         images = [np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy]
@@ -72,9 +70,7 @@ def test_adapted_to_images__sets_a_dropout_for_few_views_that_are_noisy_or_far_a
 @pytest.mark.parametrize(
     ("noise", "dropout", "dssim_weight"), [(0.0, 0.0, 0.2), (0.008, 0.0, 0.2), (0.05, 0.2, 0.0)]
 )
-def test_adapted_to_images__follows_the_noise(
-    views: int, noise: float, dropout: float, dssim_weight: float
-):
+def test_adapted_to_images__follows_the_noise(views, noise, dropout, dssim_weight):
     config = FitConfig(sh_degree=0)
     adapted = adapted_to_images(config, problem(bytes_of(GREY[:views], noise)))
     objective = replace(config.objective, dssim_weight=dssim_weight)

@@ -1,7 +1,5 @@
 """The space in front of the training cameras in which nothing stands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,8 +2,6 @@
 confidence.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import pairwise
 
@@ -11,9 +9,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, RenderConfig
+from morgs_mi import RenderConfig
 from morgs_mi.core.progress import Progress
-from morgs_mi.fit.first_frame import FirstFrame, density_rounds, fit_confidence, fit_first_frame
+from morgs_mi.fit.first_frame import density_rounds, fit_confidence, fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.fit.view import View, rendered
 from morgs_mi.method.objective import ObjectiveConfig
@@ -25,7 +23,7 @@ NO_GROWTH = DensityConfig(rounds=0)
 CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=NO_GROWTH)
 
 
-def fit(images, start, config, seed=0, progress=None, **changes) -> FirstFrame:
+def fit(images, start, config, seed=0, progress=None, **changes):
     """Fit some or all of the views; `changes` are masks and the cut-offs of the renderer."""
     return fit_first_frame(
         problem(images, start, **changes), config, np.random.default_rng(seed), progress
@@ -38,7 +36,7 @@ def images():
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Gaussians]:
+def drawn(monkeypatch):
     """A list to which every step of a fit adds the Gaussians that it renders."""
     steps = []
     render = ActiveView.render
@@ -53,7 +51,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Gaussians]:
     return steps
 
 
-def values_of(gaussians: Gaussians) -> dict[str, bytes]:
+def values_of(gaussians):
     return {name: value.tobytes() for name, value in gaussians.numpy().items()}
 
 
@@ -69,7 +67,7 @@ WHITE = [np.full((48, 64, 3), 255, np.uint8)]
 DARK = dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
 
 
-def lengths(drawn: list[Gaussians], first_frame: FirstFrame) -> np.ndarray:
+def lengths(drawn, first_frame):
     """Return the length of each step of the colours."""
     colors = np.array(
         [np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, first_frame.gaussians]]
@@ -274,7 +272,7 @@ def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images)
 # --------------------------------------------------------------------------------------
 
 
-def learned(steps: int, masks: dict[int, np.ndarray]) -> tuple[Gaussians, dict[str, float]]:
+def learned(steps, masks):
     """Return the opaque ball with a confidence that follows masks, by view."""
     config = dataclasses.replace(CONFIG, confidence_steps=steps)
     cameras = {view: views()[view] for view in masks}
@@ -282,7 +280,7 @@ def learned(steps: int, masks: dict[int, np.ndarray]) -> tuple[Gaussians, dict[s
     return fit_confidence(start, cameras, masks, config, RenderConfig(), np.random.default_rng(0))
 
 
-def halves() -> dict[int, np.ndarray]:
+def halves():
     """Return masks of two key views, which mark their right half."""
     return {view: np.float32(np.tile(np.arange(64) >= 32, (48, 1))) for view in (0, 3)}
 

@@ -1,7 +1,5 @@
 """The forecast of views between the cameras of synthetic rigs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from tests.scenes.cameras import arc, look_at_cameras
 NO_POINTS = np.zeros((0, 3))
 
 
-def ring(count: int):
+def ring(count):
     return look_at_cameras(arc(2 * np.pi * np.arange(count) / count, 4), 40)
 
 

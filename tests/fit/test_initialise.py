@@ -1,13 +1,10 @@
 """The points that the first frame starts from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi import Camera
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
 from morgs_mi.fit.initialise import (
     MIN_POINTS,
@@ -31,7 +28,7 @@ def few_points():
     return (points, np.full((40, 3), 0.8)), [grey_view(camera) for camera in cameras]
 
 
-def grey_view(camera: Camera, mask: np.ndarray | None = None) -> View:
+def grey_view(camera, mask=None):
     """Return a view that is dark grey."""
     return View(camera, np.full((camera.height, camera.width, 3), 51, np.uint8), mask)
 
@@ -57,7 +54,7 @@ def test_fill_points__adds_none_where_pixels_are_not_valid():
 
 
 @pytest.mark.parametrize("count", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
-def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(count: int):
+def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(count):
     (points, colors), views = few_points()
     point_cloud = np.resize(points, (count, 3)), np.resize(colors, (count, 3))
     result, result_colors = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
@@ -69,7 +66,7 @@ def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(cou
 
 
 @pytest.mark.parametrize("count", [0, 40, 2000])
-def test_initial_points__leave_the_space_before_near_planes_empty(count: int):
+def test_initial_points__leave_the_space_before_near_planes_empty(count):
     (points, colors), views = few_points()
     views = [view._replace(camera=replace(view.camera, near=5.0)) for view in views]
     points = np.concatenate([points, points - (0, 0, 4)])
@@ -79,14 +76,14 @@ def test_initial_points__leave_the_space_before_near_planes_empty(count: int):
     assert not in_empty_space([view.camera for view in views], chosen).any()
 
 
-def moved(camera: Camera, shift: np.ndarray) -> Camera:
+def moved(camera, shift):
     """Return the camera in a world with another origin."""
     viewmat = np.array(camera.viewmat, float)
     viewmat[:3, 3] -= viewmat[:3, :3] @ shift
     return replace(camera, viewmat=viewmat)
 
 
-def parallel_cameras() -> list[Camera]:
+def parallel_cameras():
     return [
         c for x in (-1.0, 0.0, 1.0) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))
     ]
@@ -97,7 +94,7 @@ def parallel_cameras() -> list[Camera]:
     [look_at_cameras(arc((-0.4, 0, 0.4), 4), 40), parallel_cameras(), parallel_cameras()[:1]],
     ids=["converging", "parallel", "single"],
 )
-def test_focus_point__does_not_depend_on_the_origin_of_the_world(cameras: list[Camera]):
+def test_focus_point__does_not_depend_on_the_origin_of_the_world(cameras):
     shift = np.array([3.0, -2.0, 40.0])
     there = [moved(camera, shift) for camera in cameras]
     np.testing.assert_allclose(focus_point(there), focus_point(cameras) + shift, atol=1e-4)

@@ -1,7 +1,5 @@
 """A later frame: births and survivors, their order, and the parts of the motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 from morgs_mi import Gaussians, RenderConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
+from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.motion import initial_motion
@@ -23,9 +21,7 @@ EXTENT = 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 
 
-def fit(
-    previous: Gaussians, images: list[np.ndarray], config: FitConfig, motion: MotionConfig = PLAIN
-) -> LaterFrame:
+def fit(previous, images, config, motion=PLAIN):
     active = full_active_set(previous, dict(enumerate(views())), RENDER)
     targets = {view: Target(image) for view, image in enumerate(images)}
     problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
@@ -82,7 +78,7 @@ def test_fit_later_frame__adds_none_when_no_step_is_left_to_fit_them():
     assert np.array_equal(fitted.source, np.arange(200))
 
 
-def shifted(shift: tuple[float, float, float]) -> tuple[Gaussians, Gaussians, np.ndarray]:
+def shifted(shift):
     """Return a ball, the ball after a shift, and the shift."""
     ball = opaque_ball()
     by = np.array(shift, np.float32)

@@ -1,7 +1,5 @@
 """The first stage of a later frame: shared motion is found, and the residual starts from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
@@ -10,12 +8,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.motion_model import (
     MOTION_MODELS,
     MotionModel,
-    MotionModelFactory,
     sparse_product,
 )
 from morgs_mi.method.motion_start import MotionStart
@@ -24,7 +20,7 @@ from tests.scenes.shifted_ball import FIT, PLAIN, SHIFT, fit_shifted, motion_err
 
 
 @MOTION_MODELS.register("test-shift")
-def _one_shift(argument: str, config: MotionConfig) -> MotionModelFactory:
+def _one_shift(argument, config):
     """Return the factory of one translation for all Gaussians, with a loss of its own."""
 
     def make(gaussians, extent, rng):
@@ -45,9 +41,7 @@ def _one_shift(argument: str, config: MotionConfig) -> MotionModelFactory:
 MODEL = replace(PLAIN, model="test-shift")
 
 
-def fit(
-    config: FitConfig = FIT, start: MotionStart | None = None, share: float = MODEL.model_share
-):
+def fit(config=FIT, start=None, share=MODEL.model_share):
     return fit_shifted(replace(MODEL, model_share=share), start, config)
 
 

@@ -1,7 +1,5 @@
 """White noise, and texture that is none."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -9,11 +7,11 @@ import pytest
 from morgs_mi.fit.detail import is_noisy, noise_of, white_noise_of
 
 
-def bytes_of(values: np.ndarray) -> np.ndarray:
+def bytes_of(values):
     return np.clip(255 * values + 0.5, 0, 255).astype(np.uint8)
 
 
-def foliage(seed: int = 0, size: int = 128) -> np.ndarray:
+def foliage(seed=0, size=128):
     """Return a texture [S, S, 3] in [0, 1] with equal contrast in every octave, as in nature, seen
     by a lens.
     """

@@ -1,7 +1,5 @@
 """The optimisation loop: convergence, rates, order of the views, and losses that are not finite."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """The problem of a first frame, and the views that it consists of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,7 @@ from tests.scenes.cameras import look_at_cameras
 LARGE = look_at_cameras([(0, 0, -4)], 40, 160, 120)[0]
 
 
-def large_view(mask: np.ndarray | None = None) -> View:
+def large_view(mask=None):
     """Return a view of 160x120 pixels, all of them white in even columns."""
     return View(
         LARGE,
@@ -69,9 +67,7 @@ def test_mean_psnr__does_not_count_masked_pixels():
     ("width", "size"),
     [(160, (160, 120)), (81, (160, 120)), (80, (80, 60)), (50, (53, 40)), (10, (160, 120))],
 )
-def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(
-    width: int, size: tuple[int, int]
-):
+def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(width, size):
     # A reduced image has 32 pixels at least on each side.
     camera, image, mask = large_view().reduced(width)
     assert (camera.width, camera.height) == size == image.shape[1::-1]
@@ -102,7 +98,7 @@ def test_withheld_blocks__divide_the_valid_pixels():
 def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
 
-    def extent(spread: float) -> float:
+    def extent(spread):
         cameras = look_at_cameras([(x, 0, -12) for x in (-spread, spread)], 40)
         black_views = [
             View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras

@@ -1,12 +1,10 @@
 """Raw attributes of a cloud that Mitsuba's shapes can hold."""
 
-from __future__ import annotations
-
 import pytest
 
-from tests.scenes.gaussians import Values, make_unit_scene
+from tests.scenes.gaussians import make_unit_scene
 
 
 @pytest.fixture(scope="session")
-def raw() -> Values:
+def raw():
     return make_unit_scene()

@@ -1,7 +1,5 @@
 """The images that the plugin is to render, by the reference implementation."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.reference import rasterize_view

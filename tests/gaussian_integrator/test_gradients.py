@@ -1,7 +1,5 @@
 """The plugin `gaussian_splat`: derivatives of mi.render(scene, params)."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 import drjit as dr
@@ -212,7 +210,7 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     )
     names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
 
-    def gradients(image) -> list[np.ndarray]:
+    def gradients(image):
         dr.backward(dr.sum(image * weight, axis=None))
         grads = [np.array(dr.grad(params[name])) for name in names]
         for name in names:
@@ -231,9 +229,9 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
         np.testing.assert_array_equal(by_plugin, by_rasterize, err_msg=name)
 
 
-def counting_renders(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counting_renders(monkeypatch):
     """Return a list that grows with every call of the rasteriser by the integrator."""
-    calls: list[int] = []
+    calls = []
     # A change of the variant imports the module again.
     module = import_module("morgs_mi.surfaces.gaussian_splat")
     draw = module.rasterize
@@ -267,7 +265,7 @@ def test_gaussian_splat__backward_renders_what_has_changed_since(raw):
     use it.
     """
 
-    def gradient(zoom: str) -> np.ndarray:
+    def gradient(zoom):
         scene = make_mitsuba_scene(to_gaussians(raw))
         params = mi.traverse(scene)
         dr.enable_grad(params["gaussians.opacities"])

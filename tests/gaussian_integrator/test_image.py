@@ -1,7 +1,5 @@
 """The plugin `gaussian_splat`: images of mi.render(scene)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """The blocks of docs/mitsuba.md run, and its tables name the properties and channels that exist."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -19,7 +17,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 FILES = dict(re.findall(r"<!-- file ([^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL))
 
 
-def rows(title: str) -> set[str]:
+def rows(title):
     """Return the names in the first column of the table whose first column is `title`."""
     (table,) = re.findall(rf"^\| {title} \|.*\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     return set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))

@@ -1,7 +1,5 @@
 """The plugin `gaussian_splat` in Mitsuba: files, variants, changed scenes, and what it refuses."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import re
@@ -234,7 +232,7 @@ def test_gaussian_splat__is_refused_under_freeze(raw):
     assert any("gaussian_splat: expected a call outside dr.freeze" in cause for cause in causes)
 
 
-def batch_scene(raw, film: dict, **props):
+def batch_scene(raw, film, **props):
     """Return a scene of a `batch` of three cameras, and the same sensors, each with a film of its
     own.
     """

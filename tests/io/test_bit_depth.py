@@ -1,7 +1,5 @@
 """Images of 16 bits that hold the values of cameras of fewer."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

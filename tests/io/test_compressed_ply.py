@@ -2,8 +2,6 @@
 broken files.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +16,7 @@ from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats
 
 
-def round_trip(path, gaussians: Gaussians) -> Gaussians:
+def round_trip(path, gaussians):
     write_compressed_ply(path, gaussians)
     return read_compressed_ply(path)
 
@@ -94,7 +92,7 @@ def test_write_compressed_ply__writes_a_file_of_no_gaussians(tmp_path):
     assert len(round_trip(tmp_path / "g.compressed.ply", splats(0))) == 0
 
 
-def changed(path, change) -> None:
+def changed(path, change):
     file = PlyData.read(path)
     tables = {element.name: np.array(element.data) for element in file.elements}
     change(tables)
@@ -102,7 +100,7 @@ def changed(path, change) -> None:
     PlyData(elements, byte_order="<").write(str(path))
 
 
-def infinite(tables) -> None:
+def infinite(tables):
     tables["chunk"]["max_x"][0] = np.inf
 
 

@@ -1,7 +1,5 @@
 """Properties of the EXR files."""
 
-from __future__ import annotations
-
 import numpy as np
 import OpenEXR
 import pytest

@@ -1,7 +1,5 @@
 """Formats of Gaussians that are not read are named with what converts them."""
 
-from __future__ import annotations
-
 import pytest
 
 from morgs_mi.extras.imports.import_frames import import_frames

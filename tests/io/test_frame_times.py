@@ -1,7 +1,5 @@
 """Frames of clips that are cut by an edit list, and rates that headers round."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from threading import Event
 
@@ -31,14 +29,14 @@ PARTS = {
 }
 
 
-def clip(count: int = COUNT) -> list[np.ndarray]:
+def clip(count=COUNT):
     """Return images with the frame's number as bars."""
     numbers = np.arange(count)[:, None] >> np.arange(8) & 1
     bars = np.repeat(np.repeat(numbers[:, None, :, None], 8, axis=2), 32, axis=1)
     return list(np.repeat(40 + 170 * bars, 3, axis=3).astype(np.uint8))
 
 
-def number(image: np.ndarray) -> int:
+def number(image):
     """Return the frame's number in an image of `clip`."""
     return int(((image[8:24, 3::8].mean(axis=(0, 2)) > 120) * 2 ** np.arange(8)).sum())
 

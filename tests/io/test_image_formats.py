@@ -1,7 +1,5 @@
 """Images of other formats than PNG and JPEG."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

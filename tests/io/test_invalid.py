@@ -1,7 +1,5 @@
 """Invalid Gaussians of files: which and how many are named, and none reaches a renderer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,7 @@ KINDS = {
 }
 
 
-def broken(name: str, value: float, rows: list[int]) -> Gaussians:
+def broken(name, value, rows):
     """Return splats with a number in one attribute of some rows."""
     values = splats(N).numpy()[name]
     values.reshape(N, -1)[rows, -1] = value

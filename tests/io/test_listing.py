@@ -1,7 +1,5 @@
 """Files that operating systems add to folders are no content."""
 
-from __future__ import annotations
-
 from morgs_mi.io.listing import is_added, listed
 
 ADDED = (

@@ -1,7 +1,5 @@
 """Cameras of a training run of 3D Gaussian Splatting."""
 
-from __future__ import annotations
-
 import json
 import logging
 

@@ -1,7 +1,5 @@
 """PLY: exact round trips, files of other tools, and messages for broken files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba as mi
@@ -18,7 +16,7 @@ from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import RAW, make_unit_scene, to_gaussians
 
 
-def random_gaussians(n: int = 20, degree: int = 3) -> Gaussians:
+def random_gaussians(n=20, degree=3):
     """Return Gaussians with the attributes of a PLY file."""
     raw = make_unit_scene(degree, n)
     return to_gaussians(
@@ -26,7 +24,7 @@ def random_gaussians(n: int = 20, degree: int = 3) -> Gaussians:
     )
 
 
-def table(gaussians: Gaussians) -> np.ndarray:
+def table(gaussians):
     """Return one record per Gaussian in the layout of other tools."""
     raw = gaussians.numpy()
     harmonics = raw["sh_coeffs"].transpose(0, 2, 1)  # by colour
@@ -42,7 +40,7 @@ def table(gaussians: Gaussians) -> np.ndarray:
     return unstructured_to_structured(values, np.dtype([(name, "f4") for name in names]))
 
 
-def assert_same(a: Gaussians, b: Gaussians, **tolerance: float) -> None:
+def assert_same(a, b, **tolerance):
     for name, value in a.numpy().items():
         np.testing.assert_allclose(
             b.numpy()[name], value, err_msg=name, **({"rtol": 0} | tolerance)

@@ -1,7 +1,5 @@
 """PLY files of other methods: drawn as what they are, or named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
@@ -25,15 +23,15 @@ def write(path, without=(), **more):
     return path
 
 
-def varying() -> np.ndarray:
+def varying():
     return RNG.uniform(0, 1, N).astype("f4")
 
 
-def same(value: float = 0) -> np.ndarray:
+def same(value=0):
     return np.full(N, value, "f4")
 
 
-def columns(*names: str) -> dict[str, np.ndarray]:
+def columns(*names):
     return {name: varying() for name in names}
 
 

@@ -1,26 +1,23 @@
 """Prefetching in the background: order, bound, errors, and no thread that remains."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 
 import pytest
 
 from morgs_mi.io.prefetch import prefetched
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition):
     deadline = time.monotonic() + 10
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
 
 
-def workers() -> int:
+def workers():
     return sum(thread.name == "prefetch" for thread in threading.enumerate())
 
 

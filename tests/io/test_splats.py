@@ -1,7 +1,5 @@
 """Files of other tools by their names, and `.splat`."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Videos and folders of images: round trips, order, and messages for broken files."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -19,13 +17,13 @@ WIDTH = 48
 COUNT = 6
 
 
-def clip(height: int = HEIGHT, width: int = WIDTH, count: int = COUNT) -> list[np.ndarray]:
+def clip(height=HEIGHT, width=WIDTH, count=COUNT):
     return list(
         np.random.default_rng(0).integers(0, 256, (count, height, width, 3), dtype=np.uint8)
     )
 
 
-def smooth_clip(count: int = COUNT, speed: int = 1) -> list[np.ndarray]:
+def smooth_clip(count=COUNT, speed=1):
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     return [
         np.stack([120 + 80 * np.sin((x + speed * t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8)
@@ -59,7 +57,7 @@ def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(
     assert 10 * np.log10(255**2 / np.mean((got - smooth_clip()) ** 2)) > 30
 
 
-def long_video(path: Path, codec: str) -> Path:
+def long_video(path, codec):
     """Write a clip in which every frame differs; with the codec mpg2 it has frames that refer to
     later ones.
     """
@@ -83,7 +81,7 @@ def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(tmp_path
     assert "it has ended after 160 frames" in str(late[2])
 
 
-def truncated(path: Path, length: int) -> Path:
+def truncated(path, length):
     path.write_bytes(path.read_bytes()[:length])
     return path
 

@@ -1,7 +1,5 @@
 """Recordings that are hard to reconstruct: every fit stays finite and shows what it can."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Problems of images: of one colour, and cuts; motion, noise, light and exposure are none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,19 +10,19 @@ W = 64
 NAMES = ("a", "b", "c")
 
 
-def scene(seed: int) -> np.ndarray:
+def scene(seed):
     """A picture of coarse structure, uint8 [H, W, 3]."""
     coarse = np.random.default_rng(seed).integers(20, 220, (6, 8, 3))
     return np.uint8(np.repeat(np.repeat(coarse, 8, 0), 8, 1))
 
 
-def noisy(image: np.ndarray, sigma: float, seed: int = 0) -> np.ndarray:
+def noisy(image, sigma, seed=0):
     return np.uint8(
         np.clip(image + np.random.default_rng(seed).normal(0, sigma, image.shape), 0, 255)
     )
 
 
-def views(*images: np.ndarray) -> dict[int, np.ndarray]:
+def views(*images):
     return dict(enumerate(images))
 
 
@@ -40,14 +38,14 @@ RIG = views(scene(0), scene(1), scene(2))
         (np.full((H, W, 3), (200, 30, 30), np.uint8), "b: the image is of one colour; "),
     ],
 )
-def test_image_status__names_views_of_one_colour(image: np.ndarray, words: str) -> None:
+def test_image_status__names_views_of_one_colour(image, words):
     for previous_status in ({}, RIG):
         (problem,) = image_status(NAMES, previous_status, {**RIG, 1: image})
         assert problem.startswith(words)
         assert "--exclude" in problem
 
 
-def test_image_status__names_a_cut_of_all_views_or_of_one() -> None:
+def test_image_status__names_a_cut_of_all_views_or_of_one():
     (problem,) = image_status(NAMES, RIG, views(scene(3), scene(4), scene(5)))
     assert problem.startswith(
         "the images show another scene than in the frame before; end the fit before this frame"
@@ -56,7 +54,7 @@ def test_image_status__names_a_cut_of_all_views_or_of_one() -> None:
     assert problem.startswith("c: the image shows something else than in the frame before")
 
 
-def with_object(column: int) -> np.ndarray:
+def with_object(column):
     """A dull wall with a bright object."""
     image = noisy(np.full((H, W, 3), 100.0), 5)
     image[10:34, column : column + 16] = (255, 240, 200)
@@ -74,15 +72,13 @@ def with_object(column: int) -> np.ndarray:
         (np.zeros((H, W, 3), np.uint8), scene(0)),
     ],
 )
-def test_image_status__is_empty_for_motion_noise_and_light(
-    previous: np.ndarray, current: np.ndarray
-) -> None:
+def test_image_status__is_empty_for_motion_noise_and_light(previous, current):
     assert (
         image_status(NAMES, views(previous, previous, previous), views(current, current, current))
         == ()
     )
 
 
-def test_image_status__compares_views_that_have_both_images() -> None:
+def test_image_status__compares_views_that_have_both_images():
     assert image_status(NAMES, {0: RIG[0]}, {1: RIG[1]}) == ()
     assert image_status(NAMES, {}, {}) == ()

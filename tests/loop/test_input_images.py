@@ -1,7 +1,5 @@
 """The images that a caller may push, and what the loop makes of them."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Observations of a frame that follow from its images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

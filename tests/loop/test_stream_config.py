@@ -1,7 +1,5 @@
 """Settings: presets and rates."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import get_args
 
@@ -14,7 +12,7 @@ from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
 
 
-def test_PRESETS__have_the_names_of_the_option() -> None:
+def test_PRESETS__have_the_names_of_the_option():
     assert tuple(PRESETS) == get_args(PresetName)
 
 
@@ -30,7 +28,7 @@ def test_PRESETS__have_the_names_of_the_option() -> None:
         ("paper", 8, (True, True, True), False),
     ],
 )
-def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted) -> None:
+def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted):
     base = StreamConfig(fit=FitConfig(num_gaussians=77), motion=MotionConfig(key_views=12), seed=3)
     config = apply_preset(base, name)
     fit = config.fit
@@ -44,23 +42,23 @@ def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted
     assert (config.codec, config.seed) == (base.codec, 3)
 
 
-def test_apply_preset__overrides_earlier_settings_and_later_ones_override_it() -> None:
+def test_apply_preset__overrides_earlier_settings_and_later_ones_override_it():
     config = apply_preset(StreamConfig(fit=FitConfig(epochs=3)), "s")
     assert config.fit.epochs == 5
     assert apply_values(config, {"fit": {"epochs": 2}}).fit.epochs == 2
 
 
-def test_apply_preset__rejects_an_unknown_name() -> None:
+def test_apply_preset__rejects_an_unknown_name():
     with pytest.raises(ValueError, match=f"must be one of {', '.join(PRESETS)}, got 'xl'"):
         apply_preset(StreamConfig(), "xl")  # type: ignore[arg-type]
 
 
-def test_momentum__fades_in_the_same_share_of_fewer_epochs() -> None:
+def test_momentum__fades_in_the_same_share_of_fewer_epochs():
     assert FitConfig(epochs=8).momentum == 0.9
     assert FitConfig(epochs=2).momentum == pytest.approx(0.9**4)
 
 
-def test_rates_at__decays_the_rate_of_the_means_and_raises_the_others_for_fewer_epochs() -> None:
+def test_rates_at__decays_the_rate_of_the_means_and_raises_the_others_for_fewer_epochs():
     means = [FitConfig(epochs=8).rates_at(k).means / LearningRates().means for k in range(8)]
     assert means == pytest.approx([1, 1, 2 / 3, 1 / 2, 2 / 5, 1 / 3, 2 / 7, 1 / 4])
     assert all(FitConfig(decay_means_rate=False).rates_at(k) == LearningRates() for k in range(8))

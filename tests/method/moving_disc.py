@@ -1,15 +1,13 @@
 """Two frames in which a textured disc moves over a textured background."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
-from morgs_mi.method.flow import FlowObservation, observe_key_views
+from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 
 
-def texture(height: int, width: int, seed: int) -> np.ndarray:
+def texture(height, width, seed):
     """Return a random texture [H, W, 3] in [0, 1] with detail of 2 to 8 pixels."""
     rng = np.random.default_rng(seed)
     octaves = [
@@ -24,9 +22,7 @@ def texture(height: int, width: int, seed: int) -> np.ndarray:
     return np.clip(sum(octaves) / 14, 0, 1)
 
 
-def moving_disc(
-    height: int, width: int, shift: tuple[int, int], noise: float = 0.0, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def moving_disc(height, width, shift, noise=0.0, seed=0):
     """Return I_{t-1}, I_t [H, W, 3] and the disc's mask [H, W] in frame t; `shift` is (x, y) in
     pixels.
     """
@@ -42,8 +38,6 @@ def moving_disc(
     return frames[0], frames[1], mask
 
 
-def observed(
-    image: np.ndarray, previous: np.ndarray, mask_method: str | None = None
-) -> FlowObservation:
+def observed(image, previous, mask_method=None):
     """Return the flow observation of two images of one camera."""
     return observe_key_views({0: FramePair(image, previous)}, "dis", mask_method)[0]

@@ -2,16 +2,14 @@
 fitted in full.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import RenderConfig, rasterize
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
+from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.method.active_set import ActiveSet, ActiveSetConfig, find_active_set, full_active_set
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.ssim import Target
@@ -27,11 +25,11 @@ CHANNELS = {view: ("color",) for view in range(V)}
 HIDDEN = 300  # the wall's Gaussians come first
 
 
-def cameras() -> dict[int, Camera]:
+def cameras():
     return dict(enumerate(look_at_cameras(arc(np.linspace(-0.6, 0.6, V), 4, y=-0.3), 40, 128, 96)))
 
 
-def scene(shift=0.0, colors=None) -> Gaussians:
+def scene(shift=0.0, colors=None):
     """Return a wall, and in front of it a ball of 60 Gaussians that is shifted along x."""
     rng = np.random.default_rng(0)
     wall = random_sheet(rng, HIDDEN, 2, 1.0)
@@ -42,36 +40,34 @@ def scene(shift=0.0, colors=None) -> Gaussians:
     return isotropic(means, sizes, 0.95, sh, logit_confidence=np.zeros(len(means)))
 
 
-def images_of(gaussians: Gaussians) -> list[np.ndarray]:
+def images_of(gaussians):
     return [
         np.asarray(rasterize(gaussians, camera, ("color",)).color) for camera in cameras().values()
     ]
 
 
-def fit(
-    previous: Gaussians, active: ActiveSet, images: list[np.ndarray], config: FitConfig
-) -> LaterFrame:
+def fit(previous, active, images, config):
     targets = {view: Target(image) for view, image in enumerate(images)}
     problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
     return fit_later_frame(problem, config, PLAIN, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
-def previous() -> Gaussians:
+def previous():
     return scene()
 
 
 @pytest.fixture(scope="module")
-def current(previous) -> Gaussians:
+def current(previous):
     return scene(0.08, np.asarray(previous.sh_coeffs))
 
 
-def changes(previous, current) -> dict[int, np.ndarray]:
+def changes(previous, current):
     pairs = zip(images_of(previous), images_of(current), strict=True)
     return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
-def found(gaussians, changed, config=CONFIG) -> ActiveSet:
+def found(gaussians, changed, config=CONFIG):
     return find_active_set(gaussians, cameras(), changed, CHANNELS, RENDER, config)
 
 

@@ -1,12 +1,10 @@
 """Boxes around projected Gaussians, against loops over them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
-from morgs_mi.method.boxes import Boxes, boxes_around
+from morgs_mi.method.boxes import boxes_around
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.region import BlockGrid, Region
 from tests.scenes.cameras import arc, look_at_cameras
@@ -16,7 +14,7 @@ from tests.scenes.gaussians import isotropic
 
 
 @pytest.fixture(scope="module")
-def boxes() -> Boxes:
+def boxes():
     rng = np.random.default_rng(0)
     means = rng.uniform(-2, 2, (50, 3)) * (1, 1, 0.3)
     means[7] = (0, 0, -9)  # behind the camera
@@ -25,7 +23,7 @@ def boxes() -> Boxes:
     )
 
 
-def slices(boxes: Boxes) -> list[tuple[slice, slice]]:
+def slices(boxes):
     corners = (
         np.asarray(side).astype(int) for side in (boxes.left, boxes.top, boxes.right, boxes.bottom)
     )

@@ -1,7 +1,5 @@
 """Change detection: against noise, for slow changes, and for flow in the box around a change."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -94,7 +92,7 @@ def test_change_mask__takes_floats_like_bytes():
 
 
 @pytest.mark.parametrize(("size", "step"), [(8, (2, 2, 2)), (16, (3, -3, 0))])
-def test_change_mask__ignores_blocks_of_compressed_video(size: int, step: tuple[int, int, int]):
+def test_change_mask__ignores_blocks_of_compressed_video(size, step):
     rng = np.random.default_rng(9)
     image = noisy_image(rng, noise=1)
     next_image = noisy_image(rng, noise=1)

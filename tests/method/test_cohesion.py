@@ -1,7 +1,5 @@
 """Cohesion: an object moves as a whole, and a patch of a large static surface does not."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from morgs_mi.core.color_space import SH_C0

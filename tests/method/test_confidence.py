@@ -1,7 +1,5 @@
 """Motion masks: empty for a static scene, and the object where one moves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Densification scores from the adjoint of a step, against back-projections."""
 
-from __future__ import annotations
-
 import cv2
 import drjit as dr
 import numpy as np

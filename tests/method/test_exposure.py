@@ -2,8 +2,6 @@
 common.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -20,15 +18,15 @@ from morgs_mi.method.exposure import (
 WARM = Exposure((1.1, 1.0, 0.9), (0.02, 0.0, -0.01))
 
 
-def scene(seed: int = 0, size: tuple[int, int] = (60, 80)) -> np.ndarray:
+def scene(seed=0, size=(60, 80)):
     return np.random.default_rng(seed).uniform(0.1, 0.8, (*size, 3))
 
 
-def as_bytes(colors: np.ndarray) -> np.ndarray:
+def as_bytes(colors):
     return np.rint(255 * colors.clip(0, 1)).astype(np.uint8)
 
 
-def assert_close(value: Exposure, expected: Exposure, atol: float) -> None:
+def assert_close(value, expected, atol):
     np.testing.assert_allclose((value.gain, value.bias), (expected.gain, expected.bias), atol=atol)
 
 
@@ -123,7 +121,7 @@ def test_common_change__needs_three_cameras():
 
 
 @pytest.mark.parametrize("noise", [0, 2])
-def test_follow_exposure__is_none_without_a_change(noise: int):
+def test_follow_exposure__is_none_without_a_change(noise):
     rng = np.random.default_rng(2)
     image = as_bytes(scene(size=(120, 160)))
     noisy = np.clip(image + rng.normal(0, noise, image.shape).round(), 0, 255).astype(np.uint8)

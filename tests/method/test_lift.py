@@ -1,7 +1,5 @@
 """Lifted flow: exact flow gives the true displacement, also with noise or one wrong view."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Registries of flow sources and mask refiners: look-up by string, and extension by one file."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -21,8 +19,8 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def registry() -> Registry[str, int]:
-    registry: Registry[str, int] = Registry("paint()", "brush", int)
+def registry():
+    registry = Registry("paint()", "brush", int)
     registry.register("file", "PATH")(lambda argument, config: f"file {argument} {config}")
     registry.register("round")(lambda argument, config: f"round {argument}{config}")
     return registry

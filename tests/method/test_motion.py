@@ -1,12 +1,9 @@
 """The start of the motion: its stages, one after the other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
-import pytest
 from scipy.spatial import KDTree
 
 from morgs_mi import RenderConfig
@@ -21,7 +18,7 @@ from tests.scenes.ball import opaque_ball, views
 SHIFT = np.float32([0.06, -0.03, 0.02])
 
 
-def start(config: MotionConfig):
+def start(config):
     """Return the start of a ball that goes on moving by `SHIFT`, without any flow."""
     ball = opaque_ball()
     previous_gaussians = replace(
@@ -56,7 +53,7 @@ def test_initial_motion__runs_the_stages_that_are_on():
     assert motion.color_change is not None
 
 
-def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch: pytest.MonkeyPatch):
+def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch):
     """The stages and the cohesion share it; the search has its own, of displaced Gaussians."""
     built = []
     monkeypatch.setattr(cohesion, "KDTree", lambda points: built.append(points) or KDTree(points))

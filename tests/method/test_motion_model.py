@@ -1,7 +1,5 @@
 """Motion models: products with a sparse matrix, moved Gaussians, and the gradients of both."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -19,7 +17,7 @@ RNG = np.random.default_rng(3)
 MATRIX = csr_array(RNG.normal(size=(9, 5)) * (RNG.random((9, 5)) < 0.4), dtype=np.float32)
 
 
-def tensor(*shape: int) -> mi.TensorXf:
+def tensor(*shape):
     return mi.TensorXf(RNG.normal(size=shape).astype(np.float32))
 
 

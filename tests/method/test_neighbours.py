@@ -1,7 +1,5 @@
 """Nearest neighbours: against all distances, for all points and for some."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

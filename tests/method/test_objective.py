@@ -1,7 +1,5 @@
 """The objective: which terms act where, what they need rendered, and what they add up."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
@@ -35,7 +33,7 @@ W = 24
 NAMES = [term.name for term in TERMS]
 
 
-def key_view(mask: bool) -> KeyView:
+def key_view(mask):
     image = np.zeros((H, W, 3), np.uint8)
     flow = np.ones((H, W, 2), np.float32)
     everywhere = np.ones((H, W), bool)
@@ -68,7 +66,7 @@ def test_channels_of__are_those_of_the_terms_that_act():
 def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
     rng = np.random.default_rng(0)
 
-    def tensor(*shape: int) -> mi.TensorXf:
+    def tensor(*shape):
         values = mi.TensorXf(rng.uniform(0.2, 0.8, shape).astype(np.float32))
         dr.enable_grad(values)
         return values

@@ -1,7 +1,5 @@
 """Motion proposals: from the previous frame and from neighbours, where flow fails."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba as mi

@@ -1,7 +1,5 @@
 """The gated residual (eq. 12): values, gates and gradients."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

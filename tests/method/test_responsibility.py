@@ -1,7 +1,5 @@
 """Responsibility: against the exact ratio of blend weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

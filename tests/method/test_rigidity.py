@@ -2,8 +2,6 @@
 differences.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morgs_mi import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
 from morgs_mi.method.rigidity import find_neighbours, isometry_loss, rigid_loss, rotation_loss
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
@@ -29,7 +26,7 @@ def neighbours():
     return pairs
 
 
-def other(seed: int = 0, size: float = 0.1) -> Gaussians:
+def other(seed=0, size=0.1):
     """Return the Gaussians, each moved and turned by itself."""
     rng = np.random.default_rng(seed)
     start = to_gaussians(BEFORE)
@@ -39,7 +36,7 @@ def other(seed: int = 0, size: float = 0.1) -> Gaussians:
     return replace(start, means=means, quats=quats)
 
 
-def reference(gaussians: Gaussians) -> dict[str, float]:
+def reference(gaussians):
     """Return the losses in float64, pair by pair."""
     start = to_gaussians(BEFORE)
     old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (start, gaussians))

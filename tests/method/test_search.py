@@ -1,7 +1,5 @@
 """Coarse search: parts that move farther than they are wide."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

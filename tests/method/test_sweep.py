@@ -1,7 +1,5 @@
 """Sums of a sweep over the key views, against each view rendered and back-projected on its own."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

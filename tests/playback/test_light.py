@@ -2,10 +2,7 @@
 inserted scenes.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,14 +27,14 @@ def bright_cloud():
     return replace(gaussians, sh_coeffs=gaussians.sh_coeffs + 1.2 / SH_C0)
 
 
-def written(path: Path, metadata: dict) -> Path:
+def written(path, metadata):
     with StreamWriter(path, [camera()], 10, metadata) as writer:
         writer.write(keyframe_packet(bright_cloud(), 0))
     return path
 
 
 @pytest.fixture
-def stream(tmp_path: Path):
+def stream(tmp_path):
     return open_stream(
         written(tmp_path / "s.morgs", {"transfer": {"name": TRANSFER, "display_exposure": STOPS}})
     )

@@ -1,7 +1,5 @@
 """Playback: channels, cameras, ground truth on the stream's grid, speed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from contextlib import nullcontext
@@ -10,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.player import (
     channel_image,
     has_confidence,
@@ -35,7 +32,7 @@ from morgs_mi.render.render_config import RenderConfig
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
-def capture_of(stream: StreamReader) -> Capture:
+def capture_of(stream):
     return open_stream_capture(stream, None, [0])
 
 

@@ -2,8 +2,6 @@
 files.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
@@ -48,7 +46,7 @@ __all__ = ["run"]
 
 
 @pytest.fixture(params=(0, 3), ids=lambda degree: f"degree {degree}")
-def file(tmp_path, request) -> Path:
+def file(tmp_path, request):
     write_ply(tmp_path / "scene.ply", splats(degree=request.param))
     return tmp_path / "scene.ply"
 
@@ -79,7 +77,7 @@ def test_splat_file__is_coded_like_any_keyframe(file, tmp_path):
     assert [written_packet.encoded for written_packet in written] == [packet.encoded]
 
 
-def write_model(folder: Path, cameras, **change) -> Path:
+def write_model(folder, cameras, **change):
     """Write a model as a training run does, and return its Gaussians."""
     path = folder / "point_cloud" / "iteration_7" / "point_cloud.ply"
     path.parent.mkdir(parents=True)
@@ -186,7 +184,7 @@ def test_splat_file__without_gaussians_is_named(tmp_path):
         open_stream(tmp_path / "scene.ply")
 
 
-def ring(center, count: int = 6) -> list[Camera]:
+def ring(center, count=6):
     """Return cameras on a circle that look at its centre."""
     angles = 2 * np.pi * np.arange(count) / count
     origins = [np.add(center, (5 * np.sin(a), 0, -5 * np.cos(a))) for a in angles]
@@ -235,7 +233,7 @@ def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
     assert open_stream(path).cameras_file == tmp_path / "cameras.json"
 
 
-def with_nan(path: Path, rows: int) -> Path:
+def with_nan(path, rows):
     """Write 40 splats, the first of which have no finite centre."""
     means = splats().numpy()["means"]
     means[:rows] = np.nan

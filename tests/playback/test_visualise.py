@@ -1,7 +1,5 @@
 """Visualisation: meaning of the colours, sizes of sheets, atomic files."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -6,19 +6,14 @@ determinant cancels for needles. Pixels where an alpha lies within `AMBIGUOUS` o
 excluded: there, rounding decides what is drawn.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi import Camera, RenderConfig, rasterize
+from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
-from tests.scenes.extremes import Case
-from tests.scenes.gaussians import CHANNELS, Values
+from tests.scenes.gaussians import CHANNELS
 
 SIZES = {"color": 3, "motion": 2}
 ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
@@ -31,27 +26,21 @@ CONFIG = RenderConfig(stop_transmittance=1e-12)
 class Activated:
     """Activated attributes, as the plugin passes them, without a logit or a logarithm."""
 
-    def __init__(self, values: Values) -> None:
+    def __init__(self, values):
         one = dr.opaque(mi.Float, 1)  # multiplying copies what Dr.Jit borrows from NumPy
         for name in ATTRIBUTES:
             setattr(self, name, mi.TensorXf(np.ascontiguousarray(values[name], np.float32)) * one)
         self.tensors = [getattr(self, name) for name in ATTRIBUTES]
         dr.enable_grad(*self.tensors)
 
-    def rows(self, name: str, index: Any) -> list[Any]:
+    def rows(self, name, index):
         return tensor_rows(getattr(self, name), index)
 
-    def gradients(self) -> Values:
+    def gradients(self):
         return {name: np.asarray(dr.grad(getattr(self, name)), np.float64) for name in ATTRIBUTES}
 
 
-def exact_image(
-    values: dict[str, Any],
-    camera: Camera,
-    alpha_min: float = 1 / 255,
-    alpha_max: float = 0.99,
-    viewmat: Any = None,
-) -> dict[str, Any]:
+def exact_image(values, camera, alpha_min=1 / 255, alpha_max=0.99, viewmat=None):
     """Return the reference's channels of activated attributes."""
     with np.errstate(all="ignore"):
 
@@ -81,7 +70,7 @@ def exact_image(
         )
 
 
-def clear_pixels(values: Values, camera: Camera) -> np.ndarray:
+def clear_pixels(values, camera):
     """Return the mask of the pixels [H, W] where no alpha is near a cut-off, found by moving the
     cut-offs.
     """
@@ -96,9 +85,7 @@ def clear_pixels(values: Values, camera: Camera) -> np.ndarray:
     return (low == high) & (np.abs(under - 2 * at + over) < 1e-6)
 
 
-def weights(
-    expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1
-) -> dict[str, np.ndarray]:
+def weights(expected, clear, seed=1):
     """Return random weights per channel, relative to its scale, for a loss of all channels."""
     rng = np.random.default_rng(seed)
     solid = clear & (expected["alpha"][..., 0] > 0.02)
@@ -112,7 +99,7 @@ def weights(
     return result
 
 
-def exact_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]) -> Values:
+def exact_gradients(values, camera, weight):
     """Return gradients by complex steps relative to each number: none from 1e-30 to 1e30 loses its
     imaginary part.
     """
@@ -129,9 +116,7 @@ def exact_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray
     return grads
 
 
-def exact_slope(
-    values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray
-) -> float:
+def exact_slope(values, camera, weight, name, along):
     """Return the derivative of the weighted channels along a direction of one attribute."""
     image = exact_image(
         {**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera
@@ -139,12 +124,7 @@ def exact_slope(
     return float(sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30)
 
 
-def run(
-    values: Values,
-    camera: Camera,
-    weight: dict[str, np.ndarray] | None = None,
-    config: RenderConfig = CONFIG,
-) -> tuple[Values, Values]:
+def run(values, camera, weight=None, config=CONFIG):
     """Return the channels and the gradients of the sum of the weighted channels; all must be
     finite.
     """
@@ -164,7 +144,7 @@ def run(
     return channels, grads
 
 
-def errors(case: Case) -> dict[str, float]:
+def errors(case):
     """Return the errors of the image and of each attribute's gradient against the reference."""
     values = case.values
     camera = case.camera

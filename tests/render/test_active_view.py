@@ -1,7 +1,5 @@
 """An active view against the full view: same pixels, same gradients."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,22 +18,22 @@ ACTIVE = np.arange(0, 120, 5)
 
 
 @pytest.fixture(scope="module")
-def camera() -> Camera:
+def camera():
     return make_wide_camera()
 
 
 @pytest.fixture(scope="module")
-def gaussians() -> Gaussians:
+def gaussians():
     return Gaussians(**make_wide_scene(N))
 
 
 @pytest.fixture(scope="module")
-def mask(camera: Camera) -> np.ndarray:
+def mask(camera):
     y, x = np.mgrid[: camera.height, : camera.width]
     return (x - 30) ** 2 + (y - 20) ** 2 < 20**2
 
 
-def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
+def split(camera, gaussians, mask):
     """Return the view of the static Gaussians, and the active Gaussians."""
     active = np.isin(np.arange(N), ACTIVE)
     view = make_active_view(
@@ -44,7 +42,7 @@ def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
     return view, gaussians.select(active)
 
 
-def drawn_pixels(view: ActiveView) -> np.ndarray:
+def drawn_pixels(view):
     """Return 1 on the pixels of the view's blocks [H, W], 0 elsewhere."""
     assert view.region is not None
     return np.asarray(view.region.mask, float)

@@ -1,7 +1,5 @@
 """Backgrounds: a colour of the renderer's settings, and an image of a camera."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """Several cameras in one call of `rasterize`, against one call for each."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
@@ -9,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi import rasterize
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import make_camera
@@ -18,7 +16,7 @@ from tests.scenes.gaussians import make_scene, to_gaussians
 CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
 
 
-def cameras(count: int) -> list[Camera]:
+def cameras(count):
     """Return cameras beside each other, with sizes that are no multiples of a block."""
     camera = replace(make_camera(), width=45, height=37)
     viewmats = [np.array(camera.viewmat, np.float64) for _ in range(count)]
@@ -28,7 +26,7 @@ def cameras(count: int) -> list[Camera]:
 
 
 @pytest.fixture(scope="module")
-def gaussians() -> Gaussians:
+def gaussians():
     return to_gaussians(make_scene())
 
 
@@ -50,7 +48,7 @@ def test_rasterize__sums_the_gradients_of_cameras():
     views = cameras(3)
     weights = np.random.default_rng(0).normal(size=(3, 37, 45, 3)).astype(np.float32)
 
-    def gradients(draw) -> dict[str, np.ndarray]:
+    def gradients(draw):
         trained = to_gaussians(make_scene(), grad=True)
         poses = [mi.TensorXf(np.array(camera.viewmat)) for camera in views]
         dr.enable_grad(poses)

@@ -1,7 +1,5 @@
 """Channels of the table of attributes, with rows that a test adds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr

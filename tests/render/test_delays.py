@@ -1,14 +1,12 @@
 """Views at a time of their own: delays and rolling shutters displace what moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi import rasterize
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.testing import assert_close
@@ -18,7 +16,7 @@ from tests.scenes.gaussians import make_scene, to_gaussians
 
 
 @pytest.fixture(scope="module")
-def moving() -> tuple[dict[str, np.ndarray], Camera]:
+def moving():
     """Gaussians that move by up to a few pixels in a frame, a learned offset included; and a
     camera.
     """
@@ -27,7 +25,7 @@ def moving() -> tuple[dict[str, np.ndarray], Camera]:
     return raw, make_camera()
 
 
-def test_rasterize__shows_gaussians_where_they_are_after_a_delay(moving) -> None:
+def test_rasterize__shows_gaussians_where_they_are_after_a_delay(moving):
     raw, camera = moving
     expected = rasterize(
         to_gaussians({**raw, "means": raw["means"] + 0.4 * raw["motion"]}), camera, ("color",)
@@ -39,7 +37,7 @@ def test_rasterize__shows_gaussians_where_they_are_after_a_delay(moving) -> None
     assert np.array_equal(still, rasterize(without, camera, ("color",)).color)
 
 
-def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving) -> None:
+def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving):
     raw, camera = moving
     rows = camera.project(raw["means"])[0][:, 1] / camera.height
     delays = 0.1 - 0.5 * (np.clip(rows, 0, 1) - 0.5)[:, None]
@@ -50,11 +48,11 @@ def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving) -> None:
     assert_close(image.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
 
 
-def test_rasterize__backward_agrees_with_central_differences_after_a_delay(moving) -> None:
+def test_rasterize__backward_agrees_with_central_differences_after_a_delay(moving):
     raw, camera = moving
     camera = replace(camera, delay=-0.3, readout=0.6)
 
-    def loss(gaussians: Gaussians):
+    def loss(gaussians):
         return dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None)
 
     gaussians = to_gaussians(raw, grad=True)
@@ -69,7 +67,7 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
         assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
 
 
-def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> None:
+def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving):
     """The decoded motion is the whole displacement."""
     raw, camera = moving
     start = replace(to_gaussians(raw), motion=None, offset=None)
@@ -90,7 +88,7 @@ def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> No
     )
 
 
-def test_rasterize__draws_the_guided_part_of_the_motion(moving) -> None:
+def test_rasterize__draws_the_guided_part_of_the_motion(moving):
     raw, camera = moving
     guided = to_gaussians({**raw, "motion": raw["motion"] - raw["offset"]})
     image = rasterize(to_gaussians(raw), camera, ("motion", "guided_motion"))

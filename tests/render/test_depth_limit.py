@@ -1,14 +1,12 @@
 """`rasterize` with a depth limit per pixel: closed forms, the reference, derivatives, bad input."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.special import erf
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.render.projection import project
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
@@ -20,7 +18,7 @@ from tests.scenes.gaussians import CHANNELS, RAW, isotropic, to_gaussians
 
 
 @pytest.fixture(scope="module")
-def limit(scene) -> np.ndarray:
+def limit(scene):
     """A tilted plane through the cloud, with a part at infinity and one in front of everything."""
     _, camera = scene
     x, y = np.meshgrid(np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height))
@@ -126,7 +124,7 @@ def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
 
 
-def _large_gaussian() -> tuple[Gaussians, Camera]:
+def _large_gaussian():
     (camera,) = look_at_cameras([(0, 0, -40)], 3)
     quat = np.array([[0.9, 0.2, -0.3, 0.15]])
     return Gaussians.from_activated(

@@ -5,8 +5,6 @@ Gradients are compared by attribute, relative to the largest entry. Gradients of
 and opacities are per relative change, as for an optimiser of logarithms.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -25,11 +23,11 @@ from tests.render.exact import (
     run,
     weights,
 )
-from tests.scenes.extremes import CASES, REFUSED, Case, eye, random_case, raw_gaussians
+from tests.scenes.extremes import CASES, REFUSED, eye, random_case, raw_gaussians
 from tests.scenes.gaussians import CHANNELS
 
 
-def failures(case: Case) -> list[str]:
+def failures(case):
     """Return the failed comparisons of a case, empty if all pass."""
     try:
         largest_errors = errors(case)
@@ -151,7 +149,7 @@ def test_rasterize__refuses_non_finite_attributes_anywhere(change, message):
         rasterize(raw_gaussians(**change), eye(), CHANNELS, BACKGROUND, config=CONFIG)
 
 
-def fuzz(seeds: range) -> list[str]:
+def fuzz(seeds):
     return [line for seed in seeds for line in failures(random_case(seed))]
 
 

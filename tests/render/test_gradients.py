@@ -2,8 +2,6 @@
 each other.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

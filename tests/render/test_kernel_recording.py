@@ -2,11 +2,8 @@
 interfere.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,13 +13,11 @@ import pytest
 from morgs_mi.render import kernel_recording
 
 
-def scaled(factor: int, *arrays: Any) -> list[Any]:
+def scaled(factor, *arrays):
     return [factor * array for array in arrays]
 
 
-def test_recorded__bounds_the_number_of_recordings(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_recorded__bounds_the_number_of_recordings(monkeypatch, capfd):
     made = []
     freeze = dr.freeze
     monkeypatch.setattr(kernel_recording, "MOST_RECORDINGS", 10)

@@ -1,7 +1,5 @@
 """The renderer with thousands of layers on a pixel, and millions of Gaussians."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

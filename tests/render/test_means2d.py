@@ -1,7 +1,5 @@
 """Gradients of projected means, signed and absolute."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

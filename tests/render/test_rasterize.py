@@ -1,7 +1,5 @@
 """The renderer's images against the float64 reference, and the arguments that it refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import drjit as dr

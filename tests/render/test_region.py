@@ -1,7 +1,5 @@
 """Regions against the full computation: the pixels and gradients that remain are the same."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,17 +16,17 @@ BACKGROUND = (0.2, 0.5, 0.9)
 
 
 @pytest.fixture(scope="module")
-def camera() -> Camera:
+def camera():
     return make_wide_camera()
 
 
 @pytest.fixture(scope="module")
-def raw() -> dict[str, np.ndarray]:
+def raw():
     return make_wide_scene(120)
 
 
 @pytest.fixture(scope="module")
-def mask(camera: Camera) -> np.ndarray:
+def mask(camera):
     """A disc, a single pixel in another tile, and the lower right corner."""
     y, x = np.mgrid[: camera.height, : camera.width]
     mask = (x - 30) ** 2 + (y - 20) ** 2 < 12**2
@@ -54,7 +52,7 @@ def run(raw, camera, region=None, weight=None, config=None):
 
 
 @pytest.fixture(scope="module")
-def weight(camera: Camera, mask: np.ndarray) -> dict[str, np.ndarray]:
+def weight(camera, mask):
     """Random weights on the pixels of the region's blocks, 0 elsewhere."""
     rng = np.random.default_rng(3)
     drawn = drawn_pixels(Region.of(mask), mask)

@@ -1,7 +1,5 @@
 """Settings of the renderer."""
 
-from __future__ import annotations
-
 import pytest
 
 from morgs_mi import RenderConfig

@@ -2,10 +2,6 @@
 converges.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -15,15 +11,15 @@ from morgs_mi import Gaussians, rasterize
 from tests import reference
 from tests.render.exact import BACKGROUND, CONFIG
 from tests.scenes.extremes import STIFF_CAMERA, stiff_truth
-from tests.scenes.gaussians import CHANNELS, Values
+from tests.scenes.gaussians import CHANNELS
 
 
-def descend(rate: float, steps: int) -> tuple[list[float], Values]:
+def descend(rate, steps):
     """Return the losses and the final raw attributes of Adam with one decaying learning rate for
     all attributes.
     """
 
-    def render(gaussians: Gaussians) -> Any:
+    def render(gaussians):
         return rasterize(gaussians, STIFF_CAMERA, CHANNELS, BACKGROUND, config=CONFIG).color
 
     truth = stiff_truth()

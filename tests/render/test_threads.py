@@ -2,8 +2,6 @@
 process otherwise.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -62,7 +60,7 @@ assert len(images) == min(renderers, 1)
 """
 
 
-def run(renderers: int, fits: int, count: int) -> None:
+def run(renderers, fits, count):
     command = [
         sys.executable,
         "-X",

@@ -1,14 +1,12 @@
 """Views that are drawn together, against the same views drawn one by one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.active_view import ActiveView, ViewGroup, backproject, make_active_view
 from morgs_mi.render.region import Region
@@ -22,18 +20,18 @@ ACTIVE = np.arange(0, 120, 5)
 
 
 @pytest.fixture(scope="module")
-def gaussians() -> Gaussians:
+def gaussians():
     return Gaussians(**make_wide_scene(N))
 
 
-def moved(camera: Camera, x: float) -> Camera:
+def moved(camera, x):
     """Return a camera that is displaced sideways."""
     viewmat = np.array(camera.viewmat)
     viewmat[0, 3] += x
     return replace(camera, viewmat=viewmat)
 
 
-def views_of(gaussians: Gaussians) -> list[ActiveView]:
+def views_of(gaussians):
     """Return views of several sizes: in part, as a whole, with a rolling shutter, and without
     static Gaussians.
     """
@@ -58,7 +56,7 @@ def views_of(gaussians: Gaussians) -> list[ActiveView]:
     return [*views, ActiveView(wide), none]
 
 
-def split(group: ViewGroup, image: np.ndarray) -> list[np.ndarray]:
+def split(group, image):
     """Return the image of each view on its region from an image of a group."""
     return np.split(image, np.cumsum([region.num_blocks for region in group.regions])[:-1])
 

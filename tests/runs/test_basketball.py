@@ -7,8 +7,6 @@ its folder:
 MORGS_MI_BASKETBALL=FOLDER pytest -m slow tests/runs/test_basketball.py
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Recording: a fit that is killed and resumed leaves the same files as one that was not."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -10,18 +8,16 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.codec.container import PAYLOAD, TRAILER, Packet, StreamWriter
+from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
@@ -35,7 +31,7 @@ from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
 from tests.scenes.coded_clip import history
-from tests.scenes.recording import CONFIG, FRAMES, Recording, recording, write_recording
+from tests.scenes.recording import CONFIG, FRAMES, recording, write_recording
 from tests.scenes.short_clip import Clip, pieces_of
 
 # About what the fit takes here; on a slower machine all kills come early.
@@ -43,18 +39,18 @@ SECONDS = 0.8
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory):
     """The output of a fit without interruption."""
     out = tmp_path_factory.mktemp("whole")
     stream_capture(recording(), out, CONFIG)
     return out
 
 
-def stream_of(out: Path) -> bytes:
+def stream_of(out):
     return (out / "stream.morgs").read_bytes()
 
 
-def report_of(out: Path) -> dict:
+def report_of(out):
     """Return the report without what differs between any two runs."""
     report = json.loads((out / "report.json").read_text())
     return report | {
@@ -65,7 +61,7 @@ def report_of(out: Path) -> dict:
     }
 
 
-def assert_same(out: Path, whole: Path) -> None:
+def assert_same(out, whole):
     assert stream_of(out) == stream_of(whole)
     assert report_of(out) == report_of(whole)
     assert (out / "capture.json").read_bytes() == (whole / "capture.json").read_bytes()
@@ -76,7 +72,7 @@ def assert_same(out: Path, whole: Path) -> None:
     ]
 
 
-def process(out: Path, *left: int) -> subprocess.Popen:
+def process(out, *left):
     args = [sys.executable, "-m", "tests.scenes.recording", str(out), *map(str, left)]
     started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2])
     assert started.stdout is not None
@@ -84,7 +80,7 @@ def process(out: Path, *left: int) -> subprocess.Popen:
     return started
 
 
-def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
+def kill_and_resume(whole, folder, kills):
     """Fit again and again, each time killed at a random byte of the stream or a random moment,
     until it is done.
     """
@@ -120,11 +116,11 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path, monkeypatch):
     show = Files.show
     write = StreamWriter.write
 
-    def written(writer: StreamWriter, packet: Packet) -> int:
+    def written(writer, packet):
         assert "provisional" in writer.path.name or not (tmp_path / PROVISIONAL).exists()
         return write(writer, packet)
 
-    def spy(files: Files, keyframe: Packet) -> None:
+    def spy(files, keyframe):
         show(files, keyframe)
         provisional = StreamReader(tmp_path / PROVISIONAL)
         shown.append([packet.encoded for packet in provisional])
@@ -149,7 +145,7 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
 ):
     write = StreamWriter.write
 
-    def full(writer: StreamWriter, packet: Packet) -> int:
+    def full(writer, packet):
         if "provisional" in writer.path.name:
             raise OSError(errno.ENOSPC, "No space left on device")
         assert not (tmp_path / PROVISIONAL).exists(), "it would take the room of the result"
@@ -164,7 +160,7 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
     )
 
 
-def other_fit(out: Path, push: Callable[..., Any] | None = None) -> None:
+def other_fit(out, push=None):
     """Fit with another seed into a folder; `push` replaces the fit of a frame."""
     with pytest.MonkeyPatch.context() as patch:
         if push is not None:
@@ -172,7 +168,7 @@ def other_fit(out: Path, push: Callable[..., Any] | None = None) -> None:
         stream_capture(recording(path=Path("other")), out, replace(CONFIG, seed=1))
 
 
-def files_of(out: Path) -> dict[str, bytes]:
+def files_of(out):
     return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
@@ -181,7 +177,7 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(whole, tmp_p
     out = tmp_path / "out"
     shutil.copytree(whole, out)
 
-    def fail(*_: Any) -> None:
+    def fail(*_):
         assert {name: data for name, data in files_of(out).items() if name[0] != "."} == files_of(
             whole
         )
@@ -201,7 +197,7 @@ def test_stream_capture__replaces_an_earlier_fit_together(whole, tmp_path):
     frames = []
     shutil.copytree(whole, out)
 
-    def spy(loop: StreamLoop, *args: Any) -> Any:
+    def spy(loop, *args):
         if frame := loop.state.frame:
             metadata = json.loads((out / "capture.json").read_text())
             rows = report_of(out)["frames"]
@@ -236,7 +232,7 @@ def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces
     class Killed(BaseException):
         pass
 
-    def dying(path: Path, target: Path) -> Path:
+    def dying(path, target):
         nonlocal count
         count += path.name.startswith(".next-") and path.suffix in (".morgs", ".json")
         if count >= calls:
@@ -266,7 +262,7 @@ def test_stream_capture__killed_60_times_is_the_same(whole, tmp_path):
     kill_and_resume(whole, tmp_path, 60)
 
 
-def cuts(whole: Path) -> list[int]:
+def cuts(whole):
     """Return bytes within and between packets of every kind."""
     index = StreamReader(whole / "stream.morgs").index()
     size = len(stream_of(whole))
@@ -295,7 +291,7 @@ def test_stream_capture__resumed_from_any_cut_is_the_same(whole, tmp_path):
 def test_stream_capture__resumed_after_an_interrupt_is_the_same(whole, tmp_path):
     """The stream was closed, with an index that must not stay in the middle."""
 
-    def stop(stage: str, done: float, total: float) -> None:
+    def stop(stage, done, total):
         if stage == "Later frames" and done > 2:
             raise KeyboardInterrupt
 
@@ -308,13 +304,13 @@ def test_stream_capture__resumed_after_an_interrupt_is_the_same(whole, tmp_path)
     assert_same(tmp_path / "out", whole)
 
 
-def interrupted(whole: Path, out: Path, at: int) -> Path:
+def interrupted(whole, out, at):
     shutil.copytree(whole, out)
     os.truncate(out / "stream.morgs", at)
     return out
 
 
-def played(path: Path) -> list[int]:
+def played(path):
     """Return the frames that can be played."""
     numbers = []
     with contextlib.suppress(ValueError):
@@ -322,7 +318,7 @@ def played(path: Path) -> list[int]:
     return numbers
 
 
-def brighter(capture: Recording) -> Recording:
+def brighter(capture):
     """Return another recording with the same cameras."""
     return replace(capture, point_colors=capture.point_colors / 2)
 
@@ -362,7 +358,7 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole, t
     """The other one goes on, and its files are whole."""
     refused = {}
 
-    def fit_too(stage: str, done: float, total: float) -> None:
+    def fit_too(stage, done, total):
         frame = ceil(done)
         if stage == "Later frames" and frame in (1, 3) and frame not in refused:
             with pytest.raises(
@@ -382,7 +378,7 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole, tmp_path, cha
     out = tmp_path / "out"
     reports = []
 
-    def take_away(stage: str, done: float, total: float) -> None:
+    def take_away(stage, done, total):
         frame = ceil(done) if stage == "Later frames" else 0
         if frame in reports:
             return

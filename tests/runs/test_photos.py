@@ -6,8 +6,6 @@ names their folder, with a folder for each set:
 MORGS_MI_PHOTOS=FOLDER pytest -m slow tests/runs/test_photos.py
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

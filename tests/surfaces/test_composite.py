@@ -1,9 +1,6 @@
 """Gaussians among surfaces: closed forms of the image, its derivatives, and bad scenes."""
 
-from __future__ import annotations
-
 import logging
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,13 +26,13 @@ from tests.scenes.surfaces import (
 )
 
 
-def splats(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+def splats(gaussians):
     """Return the display-referred colour and the transmittance of Gaussians alone."""
     image = rasterize(gaussians, camera())
     return np.asarray(image.color, np.float64), 1 - np.asarray(image.alpha, np.float64)
 
 
-def over(gaussians: Gaussians, linear: Any) -> np.ndarray:
+def over(gaussians, linear):
     """Return Gaussians over linear light, blended display-referred, as linear light."""
     color, transmittance = splats(gaussians)
     return decode_light(color + transmittance * encode_light(np.asarray(linear)))
@@ -193,7 +190,7 @@ def test_surfaces__leave_the_whole_scene_as_it_is():
     it = dr.zeros(mi.Interaction3f)
     names = list(mi.traverse(whole).keys())
 
-    def distance() -> float:
+    def distance():
         return float(whole.environment().sample_direction(it, mi.Point2f(0.5))[0].dist[0])
 
     old_distance = distance()
@@ -219,7 +216,7 @@ DIFFERENTIATED = {
 
 
 @pytest.fixture(scope="module")
-def differentiated() -> Any:
+def differentiated():
     # No two depths are equal: their order would change with the parameters.
     gaussians = Gaussians.concatenate(
         [cloud(z, 1, seed) for seed, z in enumerate(np.linspace(-0.8, 0.6, 40))]
@@ -239,7 +236,7 @@ def differentiated() -> Any:
 
 
 @pytest.fixture(scope="module")
-def target(differentiated) -> Any:
+def target(differentiated):
     return mi.TensorXf(np.float32(np.random.default_rng(0).uniform(size=(24, 32, 3))))
 
 

@@ -1,7 +1,5 @@
 """`SplatRays` against the sum over all Gaussians in float64, and against the rasteriser."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,7 +14,7 @@ from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 
 
-def cloud(n: int = 300, scale: float = 0.1, degree: int = 1, seed: int = 0) -> Gaussians:
+def cloud(n=300, scale=0.1, degree=1, seed=0):
     """Return Gaussians of all shapes and orientations in a ball of radius 1."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(n, 3))
@@ -30,7 +28,7 @@ def cloud(n: int = 300, scale: float = 0.1, degree: int = 1, seed: int = 0) -> G
     )
 
 
-def segments(n: int = 400, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def segments(n=400, seed=1):
     """Return origins, directions and lengths of segments, most of which begin and end among the
     Gaussians.
     """
@@ -45,16 +43,14 @@ def segments(n: int = 400, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.nd
     )
 
 
-def rays(origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray | None = None):
+def rays(origins, directions, lengths=None):
     ray = mi.Ray3f(mi.Point3f(np.float32(origins.T)), mi.Vector3f(np.float32(directions.T)))
     if lengths is not None:
         ray.maxt = mi.Float(np.float32(lengths))
     return ray
 
 
-def responses(
-    gaussians: Gaussians, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray
-):
+def responses(gaussians, origins, directions, lengths):
     """Return depth and alpha [M, N] of every Gaussian on every segment, by the formulas of the
     module's docstring.
     """
@@ -73,7 +69,7 @@ def responses(
     return depth, 1 - (1 - alpha) ** passed
 
 
-def reference(gaussians: Gaussians, *segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def reference(gaussians, *segment):
     """Return colour [M, 3] and transmittance [M]."""
     depth, alpha = responses(gaussians, *segment)
     order = depth.argsort(1, kind="stable")

@@ -1,9 +1,6 @@
 """An object inserted into a fitted clip, beside the path-traced clip that has it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import mitsuba as mi
@@ -26,7 +23,7 @@ BALL = {
 
 
 @pytest.mark.long
-def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
+def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path):
     mi.set_log_level(mi.LogLevel.Error)
     synthesize(
         "spheres",
@@ -39,7 +36,7 @@ def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
     scene = load_scene("spheres")
     camera = stream.cameras[0]
 
-    def traced(objects: dict[str, Object]) -> np.ndarray:
+    def traced(objects):
         tracer = PathTracer(replace(scene, objects={**scene.objects, **objects}))
         return tracer.render(camera, 64, 0) / 255
 

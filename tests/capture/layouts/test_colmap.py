@@ -1,10 +1,7 @@
 """COLMAP models: pycolmap reads what we write, and we read what pycolmap writes."""
 
-from __future__ import annotations
-
 import re
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -13,7 +10,6 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import find_models, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
-from morgs_mi.core.camera import Camera
 from morgs_mi.testing import assert_close
 from tests.core.test_files import tree
 from tests.scenes.captures import HEIGHT, WIDTH, rig, videos
@@ -24,7 +20,7 @@ POINTS = RNG.normal(size=(7, 3))
 COLORS = RNG.integers(0, 256, (7, 3)) / 255
 
 
-def cameras() -> list[Camera]:
+def cameras():
     return rig(("cam00", "cam01", "cam02"), shift=3)
 
 
@@ -35,12 +31,12 @@ LENSES = [
 ]
 
 
-def write(folder: Path, kind: str = "txt") -> Path:
+def write(folder, kind="txt"):
     write_colmap(folder, cameras(), POINTS, COLORS, LENSES)
     return as_binary(folder) if kind == "bin" else folder
 
 
-def as_binary(folder: Path) -> Path:
+def as_binary(folder):
     """Write a COLMAP model anew by pycolmap, as binary files."""
     model = pycolmap.Reconstruction(str(folder))
     for file in folder.iterdir():
@@ -50,7 +46,7 @@ def as_binary(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["txt", "bin"])
-def test_read_colmap__reads_what_write_colmap_writes(tmp_path: Path, kind: str) -> None:
+def test_read_colmap__reads_what_write_colmap_writes(tmp_path, kind):
     model = read_colmap(write(tmp_path, kind))
     order = np.argsort([camera.name for camera in model.cameras])
     for i, expected, lens in zip(order, cameras(), LENSES, strict=True):
@@ -66,7 +62,7 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path: Path, kind: str) 
     assert_close(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
 
 
-def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
+def test_read_colmap__projection_agrees_with_pycolmap(tmp_path):
     model = read_colmap(write(tmp_path))
     reference = pycolmap.Reconstruction(str(tmp_path))
     camera = model.cameras[0]
@@ -75,7 +71,7 @@ def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
         assert_close(camera.project(point)[0], image.project_point(point), atol=1e-9)
 
 
-def test_models__are_numbered_as_in_colmap() -> None:
+def test_models__are_numbered_as_in_colmap():
     for i, name in enumerate(MODELS):
         # INVALID is -1 and not every later id is public; the first seven are fixed by the file
         # format.
@@ -86,7 +82,7 @@ def test_models__are_numbered_as_in_colmap() -> None:
         )
 
 
-def test_write_colmap__of_a_full_disk_leaves_the_model_before(tmp_path: Path) -> None:
+def test_write_colmap__of_a_full_disk_leaves_the_model_before(tmp_path):
     points = RNG.normal(size=(100, 3))
     write_colmap(tmp_path / "new", cameras(), points)
     size = (tmp_path / "new" / "points3D.txt").stat().st_size
@@ -104,7 +100,7 @@ def test_write_colmap__of_a_full_disk_leaves_the_model_before(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, name: str) -> None:
+def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path, name):
     file = write(tmp_path, "bin") / name
     whole = file.read_bytes()
     for length in range(len(whole)):
@@ -150,9 +146,7 @@ def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, 
         ("points3D.txt", "\n1 ", "\n1 red ", "points3D.txt, line 2: expected `POINT3D_ID"),
     ],
 )
-def test_read_colmap__refuses_broken_text(
-    tmp_path: Path, file: str, old: str, new: str, message: str
-) -> None:
+def test_read_colmap__refuses_broken_text(tmp_path, file, old, new, message):
     path = write(tmp_path) / file
     text, count = re.subn(old, new, path.read_text())
     assert count
@@ -173,9 +167,7 @@ def test_read_colmap__refuses_broken_text(
         ("points3D.txt", "1 0 0 0 word 0 0 0 {}", "expected `POINT3D_ID"),
     ],
 )
-def test_read_colmap__does_not_split_long_lines(
-    tmp_path: Path, file: str, line: str, message: str
-) -> None:
+def test_read_colmap__does_not_split_long_lines(tmp_path, file, line, message):
     (write(tmp_path) / file).write_text(line.format("10 " * 2_000_000 + "10 10"))
     tracemalloc.start()
     with pytest.raises(ValueError, match=message):
@@ -185,9 +177,7 @@ def test_read_colmap__does_not_split_long_lines(
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_read_colmap__refuses_a_binary_file_of_another_number_of_entries(
-    tmp_path: Path, name: str
-) -> None:
+def test_read_colmap__refuses_a_binary_file_of_another_number_of_entries(tmp_path, name):
     file = write(tmp_path, "bin") / f"{name}.bin"
     whole = file.read_bytes()
     count = int.from_bytes(whole[:8], "little") - 1
@@ -203,9 +193,7 @@ def test_read_colmap__refuses_a_binary_file_of_another_number_of_entries(
 @pytest.mark.parametrize(
     ("names", "gap"), [((" cam1", "cam 2 ", "  cam3"), ""), (("a", "b"), "  ")]
 )
-def test_read_colmap__keeps_the_spaces_of_names_and_reads_aligned_columns(
-    tmp_path, names, gap
-) -> None:
+def test_read_colmap__keeps_the_spaces_of_names_and_reads_aligned_columns(tmp_path, names, gap):
     write_colmap(tmp_path, rig(names))
     text = (tmp_path / "images.txt").read_text()
     for name in names if gap else ():
@@ -217,9 +205,7 @@ def test_read_colmap__keeps_the_spaces_of_names_and_reads_aligned_columns(
 
 @pytest.mark.parametrize("kind", ["txt", "bin"])
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
-def test_find_models__takes_the_model_of_most_images(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str, place: str
-) -> None:
+def test_find_models__takes_the_model_of_most_images(tmp_path, caplog, kind, place):
     names = ("cam1", "cam2", "cam3")
     for number, count in (("0", 1), ("1", 3), ("10", 2), ("backup", 3)):
         folder = tmp_path / place / number
@@ -235,7 +221,7 @@ def test_find_models__takes_the_model_of_most_images(
     )
 
 
-def test_find_models__takes_the_first_of_equal_models_and_the_only_one(tmp_path: Path) -> None:
+def test_find_models__takes_the_first_of_equal_models_and_the_only_one(tmp_path):
     for number in ("1", "2"):
         write_colmap(tmp_path / "sparse" / number, rig(("cam1", "cam2")))
     assert find_models(tmp_path)[0] == tmp_path / "sparse" / "1"

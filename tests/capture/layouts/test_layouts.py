@@ -1,14 +1,10 @@
 """Every layout is found by the files in the folder and yields the same cameras and frames."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,7 +12,7 @@ import pycolmap
 import pytest
 from plyfile import PlyData, PlyElement
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts import reader_registry
 from morgs_mi.capture.layouts.calibration import Calibration, Reader, required_clips
 from morgs_mi.capture.layouts.clips import clips_by_camera, photos
@@ -44,9 +40,7 @@ POSE_ABS = 1e-9
 PIXEL_ABS = 1e-6
 
 
-def assert_holds(
-    capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0
-) -> None:
+def assert_holds(capture, names, order, shift=0.0):
     """Check that camera j has name, pose, intrinsics and images of the rig's `order[j]`."""
     cameras = rig(names, shift)
     assert capture.names == tuple(names[i] for i in order)
@@ -79,7 +73,7 @@ def assert_holds(
         "frames/images",
     ],
 )
-def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
+def test_poses_bounds__reads_meet_room(tmp_path, clips):
     assert_holds(
         load_capture(layouts.meet_room(tmp_path / "a", clips)),
         ("cam_0", "cam_2", "cam_10"),
@@ -90,7 +84,7 @@ def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("kind", ["txt", "bin"])
-def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
+def test_colmap__reads_all_models(tmp_path, model, shared, kind):
     names = ("cam10", "cam2", "cam1")
     focals, coefficients = MODELS[model]
     lens = [0.01 * (k + 1) for k in range(coefficients)]
@@ -113,7 +107,7 @@ def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind
 
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
-def test_colmap__finds_models_in_several_places(tmp_path: Path, place: str) -> None:
+def test_colmap__finds_models_in_several_places(tmp_path, place):
     layouts.colmap(tmp_path / "a")
     for file in (tmp_path / "a/sparse/0").iterdir():
         (tmp_path / "a" / place).mkdir(parents=True, exist_ok=True)
@@ -121,7 +115,7 @@ def test_colmap__finds_models_in_several_places(tmp_path: Path, place: str) -> N
     assert_holds(load_capture(tmp_path / "a"), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
-def test_find_reader__follows_the_order_of_precedence(tmp_path: Path) -> None:
+def test_find_reader__follows_the_order_of_precedence(tmp_path):
     """COLMAP, Nerfstudio, Dynamic 3D Gaussians, poses_bounds; binary before text."""
     path = layouts.nerfstudio(tmp_path / "a")
     write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
@@ -164,13 +158,8 @@ def test_find_reader__follows_the_order_of_precedence(tmp_path: Path) -> None:
     ],
 )
 def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    build,
-    clip: str,
-    camera: str,
-    left: tuple[str, ...],
-) -> None:
+    tmp_path, caplog, build, clip, camera, left
+):
     path = build(tmp_path / "a")
     for file in path.glob(clip):
         file.unlink()
@@ -185,7 +174,7 @@ def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
         assert_close(camera_.viewmat, expected[camera_.name], atol=POSE_ABS)
 
 
-def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
+def test_load_capture__names_what_reads_a_fit(tmp_path):
     (tmp_path / "stream.morgs").touch()
     start = f"{tmp_path}: expected a capture, found a fit; `morgs-mi eval {tmp_path}` scores it, "
     for content, rest in (
@@ -207,14 +196,12 @@ def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
         load_capture(tmp_path / "stream.morgs")
 
 
-def test_find_reader__finds_a_layout_that_is_added(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_find_reader__finds_a_layout_that_is_added(tmp_path, monkeypatch):
     """A new layout costs its `Reader` and an entry in `READERS`."""
     names = ("cam1", "cam2", "cam10")
     path = tmp_path / "a"
 
-    def read(path: Path) -> Calibration:
+    def read(path):
         clips = required_clips(path)
         return Calibration(tuple(rig(tuple(clips))), (Lens(),) * len(clips), tuple(clips.values()))
 
@@ -233,16 +220,16 @@ def test_find_reader__finds_a_layout_that_is_added(
     assert load_capture(path).layout == "poses_bounds"
 
 
-def edit(path: Path, change, name: str = "transforms.json") -> None:
+def edit(path, change, name="transforms.json"):
     meta = json.loads((path / name).read_text())
     change(meta)
     (path / name).write_text(json.dumps(meta))
 
 
-def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path: Path) -> None:
+def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path):
     path = layouts.nerfstudio(tmp_path / "a")
 
-    def change(meta: dict) -> None:
+    def change(meta):
         meta.update(fl_x=40.0, k1=0.02, k3=0.05, p2=0.03)
         for key in ("fl_x", "fl_y", "cx", "cy"):
             del meta["frames"][1][key]
@@ -261,7 +248,7 @@ def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path: Path) -> Non
     )
 
 
-def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
+def test_dynamic3dgs__reads_cameras(tmp_path):
     capture = load_capture(layouts.dynamic3dgs(tmp_path / "a"))
     assert (capture.layout, capture.test_views, capture.fps) == ("Dynamic 3D Gaussians", (), 30)
     assert_holds(capture, ("2", "1", "10"), (1, 0, 2), shift=3)
@@ -269,7 +256,7 @@ def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
     np.testing.assert_allclose(capture.point_colors, [[0.1, 0.2, 0.3]], rtol=1e-6)
 
 
-def split_meta(path: Path, **cameras: tuple[int, ...]) -> Path:
+def split_meta(path, **cameras):
     """Keep the `cameras` of `train_meta.json` in the files of these names."""
     meta = json.loads((path / "train_meta.json").read_text())
     for name, members in cameras.items():
@@ -282,9 +269,7 @@ def split_meta(path: Path, **cameras: tuple[int, ...]) -> Path:
     return path
 
 
-def test_dynamic3dgs__holds_out_all_test_cameras(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path, caplog):
     path = split_meta(layouts.dynamic3dgs(tmp_path / "a"), train_meta=(1,), test_meta=(10, 2))
     calibration = reader_registry.find_reader(path).read(path)
     assert (calibration.names, calibration.test_views) == (("1", "2", "10"), (1, 2))
@@ -322,9 +307,7 @@ JUNK = (
         layouts.qualisys,
     ],
 )
-def test_load_capture__ignores_what_systems_add(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, build: Callable[[Path], Path]
-) -> None:
+def test_load_capture__ignores_what_systems_add(tmp_path, caplog, build):
     path = build(tmp_path / "a")
     names = load_capture(path).names
     caplog.clear()
@@ -343,9 +326,7 @@ def test_load_capture__ignores_what_systems_add(
     "build",
     [layouts.colmap, layouts.nerfstudio, layouts.dynamic3dgs, layouts.anipose, layouts.qualisys],
 )
-def test_load_capture__reads_texts_of_windows(
-    tmp_path: Path, build: Callable[[Path], Path]
-) -> None:
+def test_load_capture__reads_texts_of_windows(tmp_path, build):
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')
     unix_capture = load_capture(path)
@@ -374,9 +355,7 @@ def test_load_capture__reads_texts_of_windows(
     ],
 )
 @pytest.mark.parametrize("layout", ["COLMAP", "Nerfstudio"])
-def test_match_clips__reads_cameras_and_frames_numbered_alike(
-    tmp_path: Path, layout: str, file: str, image: str
-) -> None:
+def test_match_clips__reads_cameras_and_frames_numbered_alike(tmp_path, layout, file, image):
     names = ("1", "2", "3")
     for i, name in enumerate(names):
         for t in range(COUNT):
@@ -389,7 +368,7 @@ def test_match_clips__reads_cameras_and_frames_numbered_alike(
     assert_holds(load_capture(tmp_path), names, (0, 1, 2))
 
 
-def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path: Path) -> None:
+def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path):
     path = layouts.colmap(tmp_path / "a")
     shutil.copy(path / "cam2.mkv", path / "cam2.mov")
     with pytest.raises(
@@ -405,9 +384,7 @@ def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path: Path) -> No
         photos(tmp_path / "b")
 
 
-def test_clips_by_camera__names_clips_in_several_folders(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_clips_by_camera__names_clips_in_several_folders(tmp_path, caplog):
     for folder in ("depth", "images", "images_2", "rgb"):
         folder_per_camera(tmp_path / folder, ("cam1", "cam2"))
     assert clips_by_camera(tmp_path) == {
@@ -450,9 +427,7 @@ RIGS = {
 
 
 @pytest.mark.parametrize(("files", "names"), RIGS.values(), ids=RIGS)
-def test_match_clips__reads_folders_of_folders(
-    tmp_path: Path, files: tuple[str, ...], names: tuple[str, ...]
-) -> None:
+def test_match_clips__reads_folders_of_folders(tmp_path, files, names):
     for i, file in enumerate(files):
         if file.endswith(".png"):
             layouts.write_image(tmp_path / file, i, 0)
@@ -465,7 +440,7 @@ def test_match_clips__reads_folders_of_folders(
     assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
-def test_anipose__reads_the_names_of_pose2sim(tmp_path: Path) -> None:
+def test_anipose__reads_the_names_of_pose2sim(tmp_path):
     path = layouts.anipose(
         tmp_path / "a", clips=lambda path, _: layouts.videos(path, ("A", "B", "C"))
     )
@@ -475,7 +450,7 @@ def test_anipose__reads_the_names_of_pose2sim(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["txt", "ply", None])
-def test_colmap__reads_points_of_several_files_or_none(tmp_path: Path, kind: str | None) -> None:
+def test_colmap__reads_points_of_several_files_or_none(tmp_path, kind):
     path = layouts.colmap(tmp_path / "a")
     file = path / "sparse/0/points3D.txt"
     if kind != "txt":
@@ -502,7 +477,7 @@ def test_colmap__reads_points_of_several_files_or_none(tmp_path: Path, kind: str
         "cam2.png",
     ],
 )
-def test_colmap__uses_its_masks(tmp_path: Path, mask: str) -> None:
+def test_colmap__uses_its_masks(tmp_path, mask):
     path = layouts.colmap(tmp_path / "a")
     folder_per_camera(path / "frames", ("cam1", "cam2", "cam10"))
     left = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -529,9 +504,7 @@ FAR = np.array([500000.0, 5300000.0, 120.0])
         layouts.qualisys,
     ],
 )
-def test_load_capture__of_a_far_rig_is_relative_to_an_origin(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, build
-) -> None:
+def test_load_capture__of_a_far_rig_is_relative_to_an_origin(tmp_path, caplog, monkeypatch, build):
     near = load_capture(build(tmp_path / "near"))
     assert near.origin == (0, 0, 0)
     monkeypatch.setattr(
@@ -547,7 +520,7 @@ def test_load_capture__of_a_far_rig_is_relative_to_an_origin(
 
 
 @pytest.mark.parametrize(("kind", "count"), [(np.float64, 1), (np.float32, 0)])
-def test_centred__keeps_points_that_are_exact(tmp_path: Path, kind: type, count: int) -> None:
+def test_centred__keeps_points_that_are_exact(tmp_path, kind, count):
     cameras = moved(rig(("cam1", "cam2", "cam3")), -FAR)
     points = (FAR[None] + 0.1).astype(kind)
     calibration = Calibration(cameras, (), (), points, points).centred(tmp_path)
@@ -555,7 +528,7 @@ def test_centred__keeps_points_that_are_exact(tmp_path: Path, kind: type, count:
     assert calibration.points.dtype == np.float32
 
 
-def test_match_clips__refuses_far_cameras_that_move(tmp_path: Path) -> None:
+def test_match_clips__refuses_far_cameras_that_move(tmp_path):
     path = layouts.nerfstudio(tmp_path / "a")
     cameras = rig(("cam1", "cam2"))
     layouts.transforms(path, [*moved(cameras, -FAR), *moved(cameras, 0.1 - FAR)])
@@ -588,13 +561,8 @@ UNREAD = {
 
 @pytest.mark.parametrize(("build", "file", "change", "names"), UNREAD.values(), ids=UNREAD)
 def test_load_capture__names_what_it_does_not_understand_once(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    build,
-    file: str,
-    change: tuple[str, str],
-    names: str,
-) -> None:
+    tmp_path, caplog, build, file, change, names
+):
     path = build(tmp_path / "a")
     old, new = change
     text = (path / file).read_text() if old else ""
@@ -605,9 +573,7 @@ def test_load_capture__names_what_it_does_not_understand_once(
     assert re.search(f"{file}: not understood and not used: {names}.$", message)
 
 
-def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path, caplog):
     path = layouts.colmap(tmp_path / "a")
     small = np.full((HEIGHT // 2, WIDTH // 2, 3), 7, np.uint8)
     write_video(path / "frames" / "cam2", [small] * COUNT, FPS)
@@ -622,7 +588,7 @@ def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(
 
 
 @pytest.mark.usefixtures("small_images")
-def test_metadata__describes_how_frames_were_read(tmp_path: Path) -> None:
+def test_metadata__describes_how_frames_were_read(tmp_path):
     path = layouts.nerfstudio(tmp_path / "a")
     metadata = load_capture(path, downscale=2, test_view=1, max_frames=3).metadata()
     assert json.loads(json.dumps(metadata)) == metadata

@@ -1,17 +1,13 @@
 """Nerfstudio's `transforms.json`: lenses, masks, splits, sizes and keys of its exporters."""
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Callable
-from pathlib import Path
 from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.clips import size_of_clip
 from morgs_mi.capture.layouts.nerfstudio import READER
 from morgs_mi.testing import assert_close
@@ -23,16 +19,14 @@ NAMES = ("cam1", "cam2", "cam10")
 PIXEL_ABS = 1e-6  # the file stores float64
 
 
-def photos(
-    path: Path, folder: str = "images", suffix: str = ".png", change: Callable = lambda meta: None
-) -> Path:
+def photos(path, folder="images", suffix=".png", change=lambda meta: None):
     """Write three photos and their `transforms.json`, after `change`."""
     layouts.nerfstudio(path)
     for i, name in enumerate(NAMES):
         (path / f"{name}.mkv").unlink()
         layouts.write_image(path / folder / f"{name}{suffix}", i, 0)
 
-    def name_photos(meta: dict) -> None:
+    def name_photos(meta):
         for frame, name in zip(meta["frames"], NAMES, strict=True):
             frame["file_path"] = f"{folder}/{name}{suffix}"
         meta["k1"] = 0
@@ -42,23 +36,23 @@ def photos(
     return path
 
 
-def write_mask(file: Path, mask: np.ndarray) -> None:
+def write_mask(file, mask):
     file.parent.mkdir(exist_ok=True)
     cv2.imwrite(str(file), mask.astype(np.uint8))
 
 
-def left_half(value: int = 255) -> np.ndarray:
+def left_half(value=255):
     """Return an image that is black in its left half."""
     return np.where(np.arange(WIDTH) < WIDTH // 2, 0, value) + np.zeros((HEIGHT, 1), int)
 
 
-def lenses(capture: Capture) -> list[tuple[str, list[float]]]:
+def lenses(capture):
     return [(view["lens"], view["distortion"]) for view in capture.metadata()["cameras"]]
 
 
 @pytest.mark.parametrize("camera_model", [None, "OPENCV", "OPENCV_FISHEYE"])
-def test_nerfstudio__reads_fisheyes_by_their_flag(tmp_path: Path, camera_model: str | None) -> None:
-    def change(meta: dict) -> None:
+def test_nerfstudio__reads_fisheyes_by_their_flag(tmp_path, camera_model):
+    def change(meta):
         meta.pop("camera_model")
         meta.update(
             {"is_fisheye": True, "k1": 0.01}
@@ -72,8 +66,8 @@ def test_nerfstudio__reads_fisheyes_by_their_flag(tmp_path: Path, camera_model: 
 
 
 @pytest.mark.parametrize("value", [255, 1])
-def test_nerfstudio__does_not_use_pixels_that_a_mask_has_black(tmp_path: Path, value: int) -> None:
-    def change(meta: dict) -> None:
+def test_nerfstudio__does_not_use_pixels_that_a_mask_has_black(tmp_path, value):
+    def change(meta):
         meta["frames"][0]["mask_path"] = "masks/cam1.png"
 
     path = photos(tmp_path / "a", change=change)
@@ -85,8 +79,8 @@ def test_nerfstudio__does_not_use_pixels_that_a_mask_has_black(tmp_path: Path, v
 
 
 @pytest.mark.usefixtures("small_images")
-def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path: Path) -> None:
-    def change(meta: dict) -> None:
+def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path):
+    def change(meta):
         meta.update(mask_path="masks/all.png", k1=0.3)
 
     path = photos(tmp_path / "a", change=change)
@@ -109,10 +103,10 @@ def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path: Pa
     np.testing.assert_array_equal(small.masks[0], blocks)
 
 
-def test_nerfstudio__masks_what_any_mask_of_a_camera_has_black(tmp_path: Path) -> None:
+def test_nerfstudio__masks_what_any_mask_of_a_camera_has_black(tmp_path):
     path = layouts.nerfstudio(tmp_path / "a")
 
-    def change(meta: dict) -> None:
+    def change(meta):
         first = meta["frames"][0] | {"file_path": "cam1/0000.png", "mask_path": "masks/a.png"}
         meta["frames"][0] = first
         meta["frames"].append(first | {"file_path": "cam1/0001.png", "mask_path": "masks/b.png"})
@@ -155,18 +149,14 @@ SPLITS = {
 
 
 @pytest.mark.parametrize(("lists", "views"), SPLITS.values(), ids=SPLITS)
-def test_nerfstudio__holds_out_the_views_of_its_splits(
-    tmp_path: Path, lists: dict, views: tuple[int, ...]
-) -> None:
+def test_nerfstudio__holds_out_the_views_of_its_splits(tmp_path, lists, views):
     path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
     assert READER.read(path).test_views == views
     assert load_capture(path).test_views == views
     assert load_capture(path, test_view=None).test_views == ()
 
 
-def test_nerfstudio__leaves_out_views_of_no_split(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nerfstudio__leaves_out_views_of_no_split(tmp_path, caplog):
     lists = {
         "train_filenames": ["images/cam1.png", "gone.png"],
         "test_filenames": ["images/cam10.png"],
@@ -186,16 +176,14 @@ def test_nerfstudio__leaves_out_views_of_no_split(
 @pytest.mark.parametrize("file_names", [("fl_x",), ("camera_angle_x", "camera_angle_y")])
 @pytest.mark.parametrize("suffix", [".JPG", ".tif"])
 @pytest.mark.parametrize("named", [True, False])
-def test_nerfstudio__takes_missing_sizes_from_the_images(
-    tmp_path: Path, file_names, suffix: str, named: bool
-) -> None:
+def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path, file_names, suffix, named):
     values = {
         "fl_x": 50.0,
         "camera_angle_x": 2 * np.arctan(WIDTH / 100),
         "camera_angle_y": 2 * np.arctan(HEIGHT / 100),
     }
 
-    def change(meta: dict) -> None:
+    def change(meta):
         del meta["w"], meta["h"]
         for frame in meta["frames"]:
             for key in ("fl_x", "fl_y", "cx", "cy"):
@@ -212,11 +200,11 @@ def test_nerfstudio__takes_missing_sizes_from_the_images(
 
 
 def test_nerfstudio__takes_missing_sizes_from_clips_once_and_leaves_out_missing_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     path = layouts.nerfstudio(tmp_path / "a")
 
-    def change(meta: dict) -> None:
+    def change(meta):
         del meta["w"], meta["h"]
         meta["frames"] *= 3  # three images of each clip
 
@@ -232,10 +220,8 @@ def test_nerfstudio__takes_missing_sizes_from_clips_once_and_leaves_out_missing_
     ]
 
 
-def test_nerfstudio__names_keys_that_it_does_not_understand_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    def change(meta: dict) -> None:
+def test_nerfstudio__names_keys_that_it_does_not_understand_once(tmp_path, caplog):
+    def change(meta):
         meta.update(
             aabb_scale=16,
             scale=1,

@@ -1,9 +1,5 @@
 """The axes and the round trip of poses_bounds.npy."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,14 +12,14 @@ from tests.scenes.full_disk import files_end_at
 BOUNDS = np.array([[1.0, 9.0], [2.0, 8.0]])
 
 
-def cameras() -> list[Camera]:
+def cameras():
     return [
         Camera.look_at((3, 1, 2), (0, 0, 0), (0, 0, 1), 50, 64, 48, "cam00"),
         Camera.look_at((-2, 1, 1), (0, 0.5, 0), (0, 0, 1), 70, 60, 50, "cam01"),
     ]
 
 
-def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path: Path) -> None:
+def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path):
     path = tmp_path / "poses_bounds.npy"
     write_poses_bounds(path, cameras(), BOUNDS)
     assert np.load(path).shape == (2, 17)
@@ -35,7 +31,7 @@ def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path: Path)
         assert_close(got.viewmat, expected.viewmat, atol=1e-12)
 
 
-def test_write_poses_bounds__of_a_full_disk_leaves_the_file_before(tmp_path: Path) -> None:
+def test_write_poses_bounds__of_a_full_disk_leaves_the_file_before(tmp_path):
     path = tmp_path / "poses_bounds.npy"
     write_poses_bounds(path, cameras(), BOUNDS)
     old_tree = tree(tmp_path)
@@ -45,7 +41,7 @@ def test_write_poses_bounds__of_a_full_disk_leaves_the_file_before(tmp_path: Pat
         assert tree(tmp_path) == old_tree
 
 
-def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
+def test_read_poses_bounds__columns_are_down_right_back(tmp_path):
     # A camera at (5, 6, 7) that looks along world +y with world +x to its right: down is -z, back
     # is -y.
     pose = [[0, 1, 0, 5, 48], [0, 0, -1, 6, 64], [-1, 0, 0, 7, 100]]
@@ -78,7 +74,7 @@ def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
         (lambda rows: rows.astype(object), "got a broken file"),
     ],
 )
-def test_read_poses_bounds__refuses_bad_files(tmp_path: Path, change, message: str) -> None:
+def test_read_poses_bounds__refuses_bad_files(tmp_path, change, message):
     path = tmp_path / "poses_bounds.npy"
     write_poses_bounds(path, cameras(), BOUNDS)
     np.save(path, change(np.load(path)))
@@ -86,9 +82,7 @@ def test_read_poses_bounds__refuses_bad_files(tmp_path: Path, change, message: s
         read_poses_bounds(path, ["cam00", "cam01"])
 
 
-def test_write_poses_bounds__refuses_cameras_that_the_format_cannot_represent(
-    tmp_path: Path,
-) -> None:
+def test_write_poses_bounds__refuses_cameras_that_the_format_cannot_represent(tmp_path):
     K = np.array([[50, 0, 30], [0, 50, 24], [0, 0, 1.0]])
     camera = Camera(K, np.eye(4), 64, 48, "cam00")
     with pytest.raises(ValueError, match=r"'cam00' must have one focal length .* use write_colmap"):

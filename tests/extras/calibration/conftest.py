@@ -1,18 +1,13 @@
 """The capture of textured planes, by short names."""
 
-from __future__ import annotations
-
 import pytest
-
-from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.points import SharedFeatures
 
 
 @pytest.fixture(scope="session")
-def capture(textured_capture: Capture) -> Capture:
+def capture(textured_capture):
     return textured_capture
 
 
 @pytest.fixture(scope="session")
-def shared(textured_features: SharedFeatures) -> SharedFeatures:
+def shared(textured_features):
     return textured_features

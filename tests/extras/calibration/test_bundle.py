@@ -1,7 +1,5 @@
 """Bundle adjustment: derivatives, and cameras from exact features with wrong matches among them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -27,14 +25,14 @@ POINTS = np.random.default_rng(0).uniform((-2, -1.5, 3), (2, 1.5, 6), (300, 3))
 DEVIATIONS = np.array([0.005] * 3 + [0.01] * 3 + [0.01, 0, 0, 0, 0])
 
 
-def seen_by(cameras, points=POINTS) -> Tracks:
+def seen_by(cameras, points=POINTS):
     """Return the exact features of all points in all cameras."""
     views, ids = (grid.ravel() for grid in np.mgrid[: len(cameras), : len(points)])
     pixels = np.concatenate([camera.project(points)[0] for camera in cameras])
     return Tracks(ids, views, pixels, np.zeros((len(ids), 3)))
 
 
-def priors_of(cameras) -> np.ndarray:
+def priors_of(cameras):
     return prior_deviations(scene_extent(cameras), CameraPriors())
 
 

@@ -1,7 +1,5 @@
 """Calibration from clips alone, up to the scale of the world, and errors for unsuitable clips."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import shutil
@@ -18,7 +16,6 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
 from morgs_mi.capture.points import match_capture
 from morgs_mi.cli.main import main
-from morgs_mi.core.camera import Camera
 from morgs_mi.extras.calibration.calibrate import (
     _DATABASE,
     CalibrateConfig,
@@ -37,20 +34,20 @@ from tests.scenes.captures import write_timed_video
 from tests.scenes.full_disk import files_end_at
 
 
-def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
+def film(path, cameras, suffix=".mkv"):
     planes = textured.textures()
     for camera in cameras:
         write_video(path / f"{camera.name}{suffix}", [textured.render(camera, planes)] * 2, 30)
     return path
 
 
-def noise(seed: int, width: int, height: int) -> np.ndarray:
+def noise(seed, width, height):
     """Return an image of smooth noise."""
     grains = np.random.default_rng(seed).integers(0, 255, (height // 2, width // 2, 3), np.uint8)
     return cv2.resize(grains, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def aligned(estimate, true):
     """Return `estimate` [n, 3] aligned to `true` by translation, rotation and scale, and the
     rotation.
     """
@@ -62,7 +59,7 @@ def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 @pytest.mark.slow
-def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
+def test_calibrate__recovers_a_rig(tmp_path, capsys):
     cameras = textured.rig(6, 240, 180)
     film(tmp_path, cameras)
     assert main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
@@ -85,7 +82,7 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.slow
-def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
+def test_calibrate__finds_the_same_poses_on_every_run(tmp_path):
     film(tmp_path, textured.rig(6, 240, 180))
     config = CalibrateConfig(shared_intrinsics=True)
     images, _ = _frames(tmp_path, config, ())
@@ -109,7 +106,7 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     [("a.JPG", "b.JPG", "c.JPG", "d.JPG"), (" a.tif", "b .webp", " c d .BMP", "e.TIFF")],
     ids=["JPEG", "spaces and other formats"],
 )
-def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, ...]) -> None:
+def test_calibrate__names_images_after_photos(tmp_path, names):
     planes = textured.textures()
     for name, camera in zip(names, textured.rig(4, 240, 180), strict=True):
         image = textured.render(camera, planes)[..., ::-1]
@@ -124,7 +121,7 @@ def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, 
 
 
 @pytest.mark.slow
-def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:
+def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path):
     sizes = [(240, 180), (320, 240)] * 3
     cameras = [camera.resized(*size) for camera, size in zip(textured.rig(), sizes, strict=True)]
     result = calibrate(film(tmp_path, cameras), CalibrateConfig(shared_intrinsics=True))
@@ -136,7 +133,7 @@ def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -> None:
+def test_calibrate__moves_principal_points_that_differ(tmp_path, capsys):
     cameras = textured.rig(6, 240, 180)
     for camera, shift in zip(cameras, np.random.default_rng(0).uniform(-6, 6, (6, 2)), strict=True):
         camera.K[:2, 2] += shift
@@ -152,8 +149,8 @@ def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -
 
 @pytest.mark.slow
 def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     film(tmp_path, textured.rig(6, 240, 180))
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: {})
     assert main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
@@ -165,8 +162,8 @@ def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
         calibrate(tmp_path, overwrite=True)
 
 
-def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
-    def rank(error: float, *fits: bool | None) -> tuple[int, int, float]:
+def test_candidate__ranks_fitting_cameras_then_poses_then_the_error():
+    def rank(error, *fits):
         model = SimpleNamespace(compute_mean_reprojection_error=lambda: error)
         return Candidate(
             "global", model, tuple(CameraCheck("", 0, 0.0, each) for each in fits)
@@ -183,14 +180,14 @@ def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_check__of_a_camera_without_points_does_not_fit() -> None:
+def test_check__of_a_camera_without_points_does_not_fit():
     check = _check("a", pycolmap.Image(), pycolmap.Reconstruction())
     assert (check.matches, check.fits) == (0, False)
     assert np.isnan(check.error)
 
 
 @pytest.mark.slow
-def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
+def test_calibrate__names_a_camera_with_another_scene(tmp_path):
     film(tmp_path, textured.rig(6, 240, 180)[1:5])
     write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
     with pytest.raises(
@@ -211,7 +208,7 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
+def test_calibrate__prints_a_verdict_per_camera(tmp_path, capsys):
     cameras = textured.rig(4, 240, 180)
     film(tmp_path, cameras)
     shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
@@ -226,9 +223,7 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
     assert "other not checked: it could not be registered and has no pose" in printed.err
 
 
-def test_calibrate__of_a_full_disk_leaves_no_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path, monkeypatch):
     write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
     model = pycolmap.Reconstruction(str(tmp_path / "found"))
     clips = film(tmp_path / "clips", textured.rig(4))
@@ -247,7 +242,7 @@ def test_calibrate__of_a_full_disk_leaves_no_model(
     assert not (clips / "sparse").exists()
 
 
-def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> None:
+def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path):
     planes = textured.textures()
     for camera in textured.rig(2, 240, 180):
         image = cv2.cvtColor(textured.render(camera, planes), cv2.COLOR_RGB2BGRA)
@@ -260,7 +255,7 @@ def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> N
         calibrate(tmp_path)
 
 
-def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path) -> None:
+def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path):
     for name, times in (("a", [0, 50, 100, 150, 200, 250, 300]), ("b", [0, 50, 100, 250, 300])):
         write_timed_video(
             tmp_path / f"{name}.mp4", [np.full((48, 64, 3), t // 2, np.uint8) for t in times], times
@@ -321,8 +316,8 @@ def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path
     ],
 )
 def test_calibrate__refuses_clips_that_cannot_be_calibrated(
-    tmp_path: Path, change, config: dict, error: type[Exception], message: str
-) -> None:
+    tmp_path, change, config, error, message
+):
     path = tmp_path / "clips"
     for name in ("a", "b", "c"):
         write_video(path / f"{name}.mkv", [noise(ord(name), 160, 120)], 30)

@@ -1,7 +1,5 @@
 """The import of pycolmap, whose logging library handles signals."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,15 +1,12 @@
 """Equations of time offsets, on a ball with images rendered at known ones."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, rasterize
-from morgs_mi.extras.calibration.offset_equations import OffsetEquations, offset_equations
+from morgs_mi import rasterize
+from morgs_mi.extras.calibration.offset_equations import offset_equations
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.ball import opaque_ball
@@ -29,7 +26,7 @@ SIZE = (48, 64, 3)
 OFFSETS = np.array([-0.6, -0.2, 0.1, 0.4, 0.3])
 
 
-def turning_ball() -> Gaussians:
+def turning_ball():
     """Return a ball that moves by about a pixel per frame, and turns."""
     ball = opaque_ball()
     x, y, z = np.asarray(ball.means).T
@@ -39,13 +36,13 @@ def turning_ball() -> Gaussians:
 
 
 def equations(
-    ball: Gaussians,
-    offsets: np.ndarray = OFFSETS,
-    held_out: Sequence[int] = (),
-    away: np.ndarray | float = 0.0,
-    positions: Sequence[tuple[float, float, float]] = POSITIONS,
-    noise: np.ndarray | None = None,
-) -> OffsetEquations:
+    ball,
+    offsets=OFFSETS,
+    held_out=(),
+    away=0.0,
+    positions=POSITIONS,
+    noise=None,
+):
     """Return the equations of a ball that is shown at offsets, with Gaussians that are away from
     their places.
     """
@@ -66,13 +63,13 @@ def equations(
     )
 
 
-def test_solution__has_a_mean_of_zero_over_the_training_views() -> None:
+def test_solution__has_a_mean_of_zero_over_the_training_views():
     held_out = equations(turning_ball(), held_out=[0])
     assert not held_out.matrix[1:, 0].any()
     np.testing.assert_allclose(held_out.solution(), OFFSETS - OFFSETS[1:].mean(), atol=0.08)
 
 
-def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places() -> None:
+def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places():
     ball = turning_ball()
     away = np.float32((0.02, -0.02, 0.01))
     np.testing.assert_allclose(
@@ -80,25 +77,25 @@ def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places(
     )
 
 
-def test_solution__is_how_far_each_view_is_ahead_with_what_the_fit_hides() -> None:
+def test_solution__is_how_far_each_view_is_ahead_with_what_the_fit_hides():
     system = equations(turning_ball())
     np.testing.assert_allclose(system.solution(), OFFSETS, atol=0.06)
     np.testing.assert_allclose(system.solution(share=0.5), 2 * system.solution())
 
 
-def test_sum__is_between_its_timestamps() -> None:
+def test_sum__is_between_its_timestamps():
     ball = turning_ball()
     both = equations(ball) + equations(ball, 0 * OFFSETS)
     np.testing.assert_allclose(both.solution(), OFFSETS / 2, atol=0.05)
 
 
-def test_matrix__does_not_change_with_a_common_offset() -> None:
+def test_matrix__does_not_change_with_a_common_offset():
     system = equations(turning_ball(), held_out=[2])
     common = np.delete(system.matrix, 2, axis=1).sum(axis=1)
     assert np.abs(np.delete(common, 2) / np.delete(system.own, 2)).max() < 0.01
 
 
-def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
+def test_errors__are_large_where_a_change_of_depth_explains_an_offset():
     ball = opaque_ball()
     pair = [(-0.8, 0.0, -4.0), (0.8, 0.0, -4.0)]
     noise = np.random.default_rng(0).normal(0, 0.02, (2, *SIZE))
@@ -117,7 +114,7 @@ def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
 
 
 @pytest.mark.slow
-def test_errors__are_those_of_repeated_noise() -> None:
+def test_errors__are_those_of_repeated_noise():
     ball = turning_ball()
     rng = np.random.default_rng(0)
     systems = [
@@ -129,7 +126,7 @@ def test_errors__are_those_of_repeated_noise() -> None:
     )
 
 
-def test_solution__leaves_views_where_they_are_without_motion() -> None:
+def test_solution__leaves_views_where_they_are_without_motion():
     still = replace(opaque_ball(), motion=np.zeros((400, 3), np.float32))
     system = equations(still)
     assert not system.own.any()

@@ -1,17 +1,12 @@
 """Refinement of cameras: with splats of a known scene, and on textured planes with exact images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.extras.calibration.bundle import changed_camera, prior_deviations
@@ -50,26 +45,24 @@ def splats():
     return isotropic(means.astype(np.float32), 0.15, 0.9, sh.astype(np.float32))
 
 
-def image_of(camera) -> np.ndarray:
+def image_of(camera):
     return np.rint(255 * rendered(splats(), camera, RenderConfig())).astype(np.uint8)
 
 
-def disturbed(cameras, scale: float = 1.0) -> list:
+def disturbed(cameras, scale=1.0):
     """Return cameras with wrong poses and focal lengths."""
     signs = np.random.default_rng(1).choice([-1, 1], (len(cameras), 11))
     return [changed_camera(c, scale * s * WRONG) for c, s in zip(cameras, signs, strict=True)]
 
 
-def turn_error(cameras, true) -> float:
+def turn_error(cameras, true):
     """Return the largest error of an angle between two viewing directions, degrees."""
     rays = (np.array([camera.viewmat[2, :3] for camera in rig]) for rig in (cameras, true))
     angles = [np.arccos(np.clip(r @ r.T, -1, 1)) for r in rays]
     return np.rad2deg(np.abs(angles[0] - angles[1]).max())
 
 
-def capture_of(
-    path: Path, gaussians: Gaussians, cameras: list[Camera], test_view: int, noise: float = 0.0
-) -> Capture:
+def capture_of(path, gaussians, cameras, test_view, noise=0.0):
     """Return a capture of Gaussians with noisy images; `noise` is a deviation in grey levels."""
     rng = np.random.default_rng(0)
     means = np.asarray(gaussians.means)
@@ -82,14 +75,14 @@ def capture_of(
 
 
 @pytest.fixture(scope="module")
-def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def splat_capture(tmp_path_factory):
     """A capture of the splats in five views, the first of which is held out."""
     cameras = look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
     return capture_of(tmp_path_factory.mktemp("splats"), splats(), cameras, test_view=0)
 
 
 @pytest.fixture(scope="module")
-def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def far_capture(tmp_path_factory):
     """A capture of distant splats in nine noisy views on a plane, the middle one of which is held
     out.
     """
@@ -206,7 +199,7 @@ def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_c
     assert refined is not splat_capture
 
 
-def matched(capture: Capture) -> tuple[np.ndarray, int]:
+def matched(capture):
     """Return the changes of the training cameras by features, and the number of tracks."""
     extent = scene_extent([capture.cameras[v] for v in capture.train_views])
     deviations = prior_deviations(extent, CameraPriors())

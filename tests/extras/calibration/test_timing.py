@@ -1,13 +1,10 @@
 """Time offsets of cameras from what moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.extras.calibration.timing import estimate_time_offsets
 from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
@@ -15,21 +12,21 @@ from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 
 
-def test_estimate_time_offsets__refuses_a_single_frame(textured_capture: Capture) -> None:
+def test_estimate_time_offsets__refuses_a_single_frame(textured_capture):
     with pytest.raises(
         ValueError, match="expected at least 4 frames to compare clocks, got 1; record longer"
     ):
         estimate_time_offsets(textured_capture)
 
 
-def test_estimate_time_offsets__refuses_a_single_camera(textured_capture: Capture) -> None:
+def test_estimate_time_offsets__refuses_a_single_camera(textured_capture):
     alone = replace(textured_capture, cameras=textured_capture.cameras[:1])
     with pytest.raises(ValueError, match="expected at least 2 cameras to compare clocks, got 1"):
         estimate_time_offsets(alone)
 
 
 @pytest.mark.long
-def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> None:
+def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path):
     clip = tmp_path / "clip"
     synthesize(
         "spheres",

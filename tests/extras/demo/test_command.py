@@ -1,17 +1,12 @@
 """`morgs-mi demo`: its options."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import Mock
-
-import pytest
 
 from morgs_mi.extras.demo.demo import DemoConfig
 
 
-def test_demo__passes_its_options_on(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo__passes_its_options_on(tmp_path, run, monkeypatch):
     demo = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr("morgs_mi.extras.demo.demo.run_demo", demo)
     (tmp_path / "a.toml").write_text("seed = 7\n[fit]\nepochs = 2\n")

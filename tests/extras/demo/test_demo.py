@@ -1,10 +1,7 @@
 """The demonstration at a small size: its files exist and are consistent."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import pytest
@@ -29,9 +26,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    steps: list[str] = []
+    steps = []
     run_demo(folder, SMALL, lambda step, done, total: steps.append(step))
     fits = [f"Fitting: {stage}" for stage in ("balancing cameras", "first frame", "later frames")]
     plain = [
@@ -42,7 +39,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_run_demo__report_is_consistent(out: Path) -> None:
+def test_run_demo__report_is_consistent(out):
     report = json.loads((out / "report.json").read_text())
     assert (report["full"]["num_frames"], report["plain"]["num_frames"]) == (4, 3)
     comparison = report["comparison"]
@@ -56,7 +53,7 @@ def test_run_demo__report_is_consistent(out: Path) -> None:
     assert {"machine", "versions", "seed", "seconds"} <= set(report)
 
 
-def test_run_demo__fits_the_first_frame_once(out: Path) -> None:
+def test_run_demo__fits_the_first_frame_once(out):
     """It does not depend on the parts of the motion."""
     first, plain = (next(iter(open_stream(out / name))) for name in ("stream", "stream_plain"))
     capture = load_capture(out / "capture")
@@ -67,14 +64,14 @@ def test_run_demo__fits_the_first_frame_once(out: Path) -> None:
     assert first.encoded == plain.encoded == packet.encoded
 
 
-def test_run_demo__writes_a_video_and_a_contact_sheet(out: Path) -> None:
+def test_run_demo__writes_a_video_and_a_contact_sheet(out):
     images = list(open_frames(out / "side_by_side.mp4").frames())
     assert [image.shape for image in images] == [(48, 4 * 64 + 3 * 4, 3)] * 4
     # Three frames of the full fit and, in the last row, one of the plain fit with the legend.
     assert cv2.imread(str(out / "contact_sheet.png")).shape[0] == 3 * (48 + 4) + max(48, 96)
 
 
-def test_run_demo__reuses_a_clip_with_the_same_settings(out: Path) -> None:
+def test_run_demo__reuses_a_clip_with_the_same_settings(out):
     marker = out / "capture" / "marker"
     marker.touch()
     for frames in (4, 1):
@@ -83,7 +80,7 @@ def test_run_demo__reuses_a_clip_with_the_same_settings(out: Path) -> None:
         assert marker.exists() == (frames == 4)
 
 
-def test_run_demo__refuses_a_folder_into_which_another_demo_writes(tmp_path: Path) -> None:
+def test_run_demo__refuses_a_folder_into_which_another_demo_writes(tmp_path):
     with (
         locked_folder(tmp_path, "test()"),
         pytest.raises(

@@ -2,8 +2,6 @@
 image.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace
@@ -24,7 +22,7 @@ SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 TYPES = {f"{KHR}:ROTATION": "VEC4", f"{KHR}:OPACITY": "SCALAR", "COLOR_0": "VEC4"}
 
 
-def read_glb(data: bytes) -> tuple[dict, bytes]:
+def read_glb(data):
     """Return the JSON and binary chunks of a .glb file, according to glTF 2.0's section on the
     binary format.
     """
@@ -43,7 +41,7 @@ def read_glb(data: bytes) -> tuple[dict, bytes]:
     return document, chunks[1][1]
 
 
-def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
+def attributes(document, binary):
     """Return the arrays of the one primitive, checked against glTF 2.0's rules on accessors and
     buffer views.
     """
@@ -68,7 +66,7 @@ def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-def gaussians_of(arrays: dict[str, np.ndarray]) -> Gaussians:
+def gaussians_of(arrays):
     harmonics = sorted(name for name in arrays if ":SH_DEGREE_" in name)
     return Gaussians.from_activated(
         arrays["POSITION"],

@@ -2,20 +2,15 @@
 validation.
 """
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import CodedFrame, keyframe_packet
+from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.extras.exports.gltf_export import gltf_axes
 from morgs_mi.extras.exports.usd import write_usd
@@ -33,14 +28,14 @@ SH = "radiance:sphericalHarmonicsCoefficients"
 FRAMES = range(4)
 
 
-def written(path: Path, states: int = 4, **options: Any) -> tuple[list[CodedFrame], Any]:
+def written(path, states=4, **options):
     """Write a stream with births and deaths and its stage, and return its states and the stage."""
     coded = write_stream(path.with_name("s.morgs"), states)
     write_usd(StreamReader(path.with_name("s.morgs")), path, range(states), **options)
     return coded, Usd.Stage.Open(str(path))
 
 
-def values(prim: Any, time: float, half: bool = False) -> dict[str, np.ndarray]:
+def values(prim, time, half=False):
     """Return the attributes of a prim at a time by their names as floats; quaternions are wxyz."""
     arrays = {}
     for name in ("positions", "orientations", "scales", "opacities", SH):
@@ -52,7 +47,7 @@ def values(prim: Any, time: float, half: bool = False) -> dict[str, np.ndarray]:
     return arrays
 
 
-def expected(gaussians: Gaussians) -> dict[str, np.ndarray]:
+def expected(gaussians):
     raw = gaussians.numpy()
     return {
         "positions": raw["means"],

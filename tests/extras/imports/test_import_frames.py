@@ -2,8 +2,6 @@
 do not fit.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +15,6 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.extras.imports.import_frames import (
     find_frames,
     import_frames,
@@ -36,7 +33,7 @@ T = 5
 N = 300
 
 
-def moving(frame: int, seed: int = 0) -> Gaussians:
+def moving(frame, seed=0):
     """Return splats of which a half moves by 0.1 per frame and becomes larger."""
     start = splats(N, 1, seed)
     moves = (np.arange(N) < N // 2)[:, None]
@@ -50,7 +47,7 @@ def moving(frame: int, seed: int = 0) -> Gaussians:
     )
 
 
-def write_frames(folder: Path, frames: list[Gaussians]) -> Path:
+def write_frames(folder, frames):
     folder.mkdir()
     for t, gaussians in enumerate(frames):
         write_ply(folder / f"frame{t}.ply", gaussians)
@@ -58,7 +55,7 @@ def write_frames(folder: Path, frames: list[Gaussians]) -> Path:
 
 
 @pytest.fixture
-def clip(tmp_path: Path) -> Path:
+def clip(tmp_path):
     return write_frames(tmp_path / "clip", [moving(t) for t in range(T)])
 
 

@@ -2,8 +2,6 @@
 against OpenCV.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -30,7 +28,7 @@ NAMES = ("trial_1-camA", "trial_1-camB", "trial_1-camC")
 LENS = (-0.2, 0.05, 0.003, -0.004, 0.01)
 
 
-def test_anipose__reads_cameras_and_their_clips(tmp_path: Path) -> None:
+def test_anipose__reads_cameras_and_their_clips(tmp_path):
     capture = load_capture(layouts.anipose(tmp_path / "a"))
     assert (capture.layout, capture.names, len(capture.points)) == ("Anipose", NAMES, 0)
     assert_is_rig(capture)
@@ -38,9 +36,7 @@ def test_anipose__reads_cameras_and_their_clips(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lens", [LENS[:4], (*LENS, 0.02, 0.01, 0.005)])
-def test_anipose__undistorts_a_dot_to_where_the_camera_projects_it(
-    tmp_path: Path, lens: tuple[float, ...]
-) -> None:
+def test_anipose__undistorts_a_dot_to_where_the_camera_projects_it(tmp_path, lens):
     path = layouts.anipose(
         tmp_path / "a", lens, lambda folder, names: dot_clips(folder, names, DOT, lens)
     )
@@ -50,7 +46,7 @@ def test_anipose__undistorts_a_dot_to_where_the_camera_projects_it(
     assert capture.metadata()["cameras"][0]["lens"] == model
 
 
-def test_anipose__reads_a_fisheye_lens(tmp_path: Path) -> None:
+def test_anipose__reads_a_fisheye_lens(tmp_path):
     path = layouts.anipose(tmp_path / "a", LENS[:4])
     file = path / "calibration.toml"
     file.write_text(file.read_text().replace('name = "camB"', 'name = "camB"\nfisheye = true'))
@@ -59,7 +55,7 @@ def test_anipose__reads_a_fisheye_lens(tmp_path: Path) -> None:
     assert cameras[1]["distortion"] == list(LENS[:4])
 
 
-def test_anipose__reads_the_tables_of_caliscope(tmp_path: Path) -> None:
+def test_anipose__reads_the_tables_of_caliscope(tmp_path):
     """They are nested and have no names; older files have rotation matrices."""
     path = layouts.anipose(tmp_path / "a")
     camera = rig(NAMES, shift=3)[1]
@@ -74,9 +70,7 @@ def test_anipose__reads_the_tables_of_caliscope(tmp_path: Path) -> None:
     assert_close(result.viewmat, camera.viewmat, atol=1e-9)
 
 
-def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files(
-    tmp_path: Path,
-) -> None:
+def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files(tmp_path):
     path = layouts.anipose(tmp_path / "a")
     (path / "calibration").mkdir()
     (path / "calibration.toml").rename(path / "calibration" / "Calib_scene.toml")
@@ -89,7 +83,7 @@ def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files
         load_capture(path)
 
 
-def test_clip_of_camera__finds_a_word_in_one_name() -> None:
+def test_clip_of_camera__finds_a_word_in_one_name():
     clips = ("vid1-camA", "vid1-camB", "cam_1", "cam_10", "x_2", "2_y")
     expected = {
         "camA": "vid1-camA",
@@ -102,7 +96,7 @@ def test_clip_of_camera__finds_a_word_in_one_name() -> None:
     assert {name: clip_of_camera(clips, name) for name in expected} == expected
 
 
-def test_captures_page__anipose_example_is_read_as_described(tmp_path: Path) -> None:
+def test_captures_page__anipose_example_is_read_as_described(tmp_path):
     page = Path(__file__).parents[3] / "docs" / "captures.md"
     (example,) = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "calibration.toml").write_text(example)

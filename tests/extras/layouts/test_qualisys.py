@@ -1,9 +1,6 @@
 """Calibrations of Qualisys: projections, units, and which cameras have clips."""
 
-from __future__ import annotations
-
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,9 +24,7 @@ NAMES = ("trial_Miqus_0_26580", "trial_Miqus_1_28984", "trial_Miqus_2_29005")
 LENS = (-0.2, 0.05, 0.003, -0.004)
 
 
-def test_qualisys__reads_the_cameras_that_have_a_clip(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_qualisys__reads_the_cameras_that_have_a_clip(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         capture = load_capture(layouts.qualisys(tmp_path / "a"))
     assert "no clip is named after 31111: left out." in caplog.text
@@ -37,7 +32,7 @@ def test_qualisys__reads_the_cameras_that_have_a_clip(
     assert_is_rig(capture)
 
 
-def test_qualisys__projects_by_the_conventions_of_the_file(tmp_path: Path) -> None:
+def test_qualisys__projects_by_the_conventions_of_the_file(tmp_path):
     """A camera 2 m above the origin looks down, with the world's x axis to its right; the image is
     100 x 80 pixels.
     """
@@ -58,7 +53,7 @@ def test_qualisys__projects_by_the_conventions_of_the_file(tmp_path: Path) -> No
     assert lens.distortion == (-0.1, 0, 0, 0), "coefficients have no unit"
 
 
-def test_qualisys__undistorts_a_dot_to_where_the_camera_projects_it(tmp_path: Path) -> None:
+def test_qualisys__undistorts_a_dot_to_where_the_camera_projects_it(tmp_path):
     path = layouts.qualisys(tmp_path / "a", LENS)
     for file in path.glob("*.mkv"):
         file.unlink()
@@ -66,7 +61,7 @@ def test_qualisys__undistorts_a_dot_to_where_the_camera_projects_it(tmp_path: Pa
     assert_dot_is_shown(load_capture(path))
 
 
-def test_qualisys__takes_precedence_over_a_converted_toml(tmp_path: Path) -> None:
+def test_qualisys__takes_precedence_over_a_converted_toml(tmp_path):
     """Pose2Sim converts the file into a TOML file, with other distortion coefficients."""
     path = layouts.qualisys(tmp_path / "a")
     (path / "Calib.toml").write_text(
@@ -75,9 +70,7 @@ def test_qualisys__takes_precedence_over_a_converted_toml(tmp_path: Path) -> Non
     assert load_capture(path).layout == "Qualisys"
 
 
-def test_qualisys__warns_of_rotated_views_and_ignores_inactive_cameras(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_qualisys__warns_of_rotated_views_and_ignores_inactive_cameras(tmp_path, caplog):
     path = layouts.qualisys(tmp_path / "a")
     text = (path / "rig.qca.txt").read_text()
     head, second = text.split('serial="28984"')
@@ -93,7 +86,7 @@ def test_qualisys__warns_of_rotated_views_and_ignores_inactive_cameras(
     assert "QTM displays 28984 rotated (viewrotation)" in caplog.text
 
 
-def test_qualisys__names_the_serial_numbers_if_no_clip_has_one(tmp_path: Path) -> None:
+def test_qualisys__names_the_serial_numbers_if_no_clip_has_one(tmp_path):
     path = layouts.qualisys(tmp_path / "a")
     for file in path.glob("*.mkv"):
         file.unlink()

@@ -1,9 +1,5 @@
 """A Mitsuba scene inserted into a stream."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,7 +36,7 @@ XML = """<scene version="3.0.0">
 
 
 @pytest.fixture
-def stream(tmp_path: Path):
+def stream(tmp_path):
     with StreamWriter(tmp_path / "s.morgs", [camera()], 10) as writer:
         for frame in range(3):
             writer.write(keyframe_packet(cloud(0.5), frame))

@@ -1,13 +1,11 @@
 """`light_probe`: directions, radiance, a plane mirror, bad input."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, light_probe, rasterize
+from morgs_mi import light_probe, rasterize
 from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
@@ -16,14 +14,14 @@ from tests.scenes.surfaces import mirrored, render, scene
 CENTER = np.array([0.3, -0.2, 0.1])
 
 
-def radiance(probe: dict, directions: np.ndarray) -> np.ndarray:
+def radiance(probe, directions):
     """Return the radiance of an environment map in directions [M, 3]."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
     si.wi = -mi.Vector3f(np.float32(directions.T))
     return np.array(mi.load_dict(probe).eval(si)).T
 
 
-def shell(color: float = 0.0, n: int = 2000) -> Gaussians:
+def shell(color=0.0, n=2000):
     """Return opaque Gaussians on a sphere around CENTER; colour 0.5 + SH_C0 `color`."""
     directions = np.random.default_rng(0).normal(size=(n, 3))
     means = CENTER + 3 * directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,9 +1,5 @@
 """`shadow_ratio` and `shadowed`: closed forms, and bad input."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -19,7 +15,7 @@ SKY = {"type": "constant", "radiance": 1.0}
 BULB = {"type": "point", "position": [0, 2, 0], "intensity": 1.0}
 
 
-def floor(positions: np.ndarray, up: bool = True) -> Gaussians:
+def floor(positions, up=True):
     """Return thin discs at positions (x, z) [M, 2] of the plane y = 0, with either sign of their
     axis.
     """
@@ -31,13 +27,13 @@ def floor(positions: np.ndarray, up: bool = True) -> Gaussians:
     )
 
 
-def disk(height: float, radius: float = 0.5) -> dict:
+def disk(height, radius=0.5):
     """Return a horizontal disk above the origin."""
     transform = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], 90).scale(radius)
     return {"type": "disk", "to_world": transform}
 
 
-def scene(**entries) -> Any:
+def scene(**entries):
     return mi.load_dict({"type": "scene", **entries})
 
 

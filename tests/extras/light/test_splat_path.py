@@ -2,17 +2,14 @@
 bad input.
 """
 
-from __future__ import annotations
-
 import logging
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.testing import assert_close
@@ -43,16 +40,14 @@ DARK = {"type": "constant", "radiance": 0.0}
 FAR = isotropic([(0, 0, -90)], 0.1, 0.5)
 
 
-def ratio(
-    gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any
-) -> np.ndarray:
+def ratio(gaussians, integrator=TRACED, spp=128, **more):
     """Return the image of the lit wall with Gaussians beside the view, over that without them."""
     lit = {"wall": wall(1), "sun": SUN}
     light = render(scene(gaussians, integrator, **lit, **more), spp=spp)
     return (light / render(scene(FAR, integrator, **lit), spp=spp))[..., 0]
 
 
-def distance_to_aside() -> np.ndarray:
+def distance_to_aside():
     """Return the distance [H, W] of ASIDE from the light that falls on the wall at each pixel."""
     view = camera()
     y, x = np.mgrid[: view.height, : view.width] + 0.5
@@ -119,7 +114,7 @@ def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
 # --------------------------------------------------------------------------------------------------
 
 
-def light_of(gaussians: Gaussians, view: Camera, srgb: bool = True) -> np.ndarray:
+def light_of(gaussians, view, srgb=True):
     """Return the premultiplied linear light of Gaussians in a view.
 
     A pixel averages over a square of variance 1 / 12 px^2 in each direction.
@@ -191,7 +186,7 @@ DIFFERENTIATED = {
 
 
 @pytest.fixture(scope="module")
-def differentiated() -> Any:
+def differentiated():
     ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4}
     ball |= {"bsdf": {"type": "diffuse"}, "emitter": {"type": "area", "radiance": 0.7}}
     board = wall(
@@ -206,7 +201,7 @@ def differentiated() -> Any:
 WEIGHTS = np.float32(np.random.default_rng(0).uniform(size=(24, 32, 3)))
 
 
-def loss(image: Any) -> Any:
+def loss(image):
     return dr.mean(image * mi.TensorXf(WEIGHTS), axis=None)
 
 

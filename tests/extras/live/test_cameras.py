@@ -2,12 +2,9 @@
 faults do.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from queue import SimpleQueue
 from threading import Timer
 
@@ -24,18 +21,18 @@ class Source:
     raised.
     """
 
-    def __init__(self, shots: int = 0) -> None:
-        self._images: SimpleQueue = SimpleQueue()
+    def __init__(self, shots=0):
+        self._images = SimpleQueue()
         self.deliver(shots)
 
-    def deliver(self, count: int = 1) -> None:
+    def deliver(self, count=1):
         for _ in range(count):
             self._images.put(IMAGE)
 
-    def end(self, error: Exception | None = None) -> None:
+    def end(self, error=None):
         self._images.put(error)
 
-    def __iter__(self) -> Iterator[np.ndarray]:
+    def __iter__(self):
         while (image := self._images.get()) is not None:
             if isinstance(image, Exception):
                 raise image
@@ -45,9 +42,9 @@ class Source:
 @pytest.fixture
 def opened():
     """Feeds that are closed in the end, with their sources."""
-    feeds: list[tuple[CameraFeed, list[Source]]] = []
+    feeds = []
 
-    def open_feed(*shots: int, timeout: float = 0.3, warm_up: float = 0.0):
+    def open_feed(*shots, timeout=0.3, warm_up=0.0):
         sources = [Source(count) for count in shots]
         cameras = {f"cam{k}": source for k, source in enumerate(sources)}
         feeds.append((CameraFeed(cameras, timeout, warm_up), sources))
@@ -60,14 +57,14 @@ def opened():
         feed.close()
 
 
-def wait_for(feed: CameraFeed, *counts: int) -> None:
+def wait_for(feed, *counts):
     """Wait until the threads have read that many images."""
     for camera, count in zip(feed._cameras, counts, strict=True):
         while not camera.shots or camera.shots[-1].number < count - 1:
             time.sleep(0.001)
 
 
-def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_it() -> None:
+def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_it():
     fast = [Shot(IMAGE, time, 0) for time in (0.0, 0.033, 0.066)]
     slow = [Shot(IMAGE, time, 0) for time in (0.01, 0.04)]
     stopped = [Shot(IMAGE, -9.0, 0)]
@@ -78,7 +75,7 @@ def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_
     assert _simultaneous([fast, slow, [], stopped]) == [True, True, False, False]
 
 
-def test_CameraFeed__skips_what_arrived_during_a_fit(opened) -> None:
+def test_CameraFeed__skips_what_arrived_during_a_fit(opened):
     feed, (a, b) = opened(1, 1)
     first = feed.newest()
     assert (first.numbers, first.dropped) == ((0, 0), 0)
@@ -94,7 +91,7 @@ def test_CameraFeed__skips_what_arrived_during_a_fit(opened) -> None:
     assert 0 <= second.skew < 0.3
 
 
-def test_CameraFeed__waits_for_new_images_of_all(opened) -> None:
+def test_CameraFeed__waits_for_new_images_of_all(opened):
     feed, (a, b) = opened(1, 1, timeout=5)
     first = feed.newest()
     a.deliver()
@@ -103,7 +100,7 @@ def test_CameraFeed__waits_for_new_images_of_all(opened) -> None:
     assert feed.newest(first).numbers == (1, 1)
 
 
-def test_CameraFeed__leaves_out_a_silent_camera_until_it_is_back(opened) -> None:
+def test_CameraFeed__leaves_out_a_silent_camera_until_it_is_back(opened):
     feed, (a, b) = opened(1, 1)
     first = feed.newest()
     a.deliver()
@@ -122,7 +119,7 @@ def test_CameraFeed__leaves_out_a_silent_camera_until_it_is_back(opened) -> None
     assert feed.newest(third).numbers == (3, 1)
 
 
-def test_CameraFeed__leaves_out_a_camera_that_ends_at_once_and_ends_with_the_last(opened) -> None:
+def test_CameraFeed__leaves_out_a_camera_that_ends_at_once_and_ends_with_the_last(opened):
     feed, (a, b) = opened(1, 1, timeout=60)
     first = feed.newest()
     b.end(ValueError("cable pulled"))
@@ -135,7 +132,7 @@ def test_CameraFeed__leaves_out_a_camera_that_ends_at_once_and_ends_with_the_las
     assert feed.problem(0) == "it has ended"
 
 
-def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
+def test_CameraFeed__names_a_camera_without_a_first_image(opened):
     feed, (_, b) = opened(1, 0)
     with pytest.raises(
         ValueError, match=r"images of cam1, got none \(it is silent\); .* longer than 0.3 s"
@@ -148,7 +145,7 @@ def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
         failing.newest()
 
 
-def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened) -> None:
+def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened):
     feed, (a, b) = opened(1, 0, timeout=5, warm_up=0.2)
     start = time.monotonic()
     Timer(0.1, b.deliver).start()
@@ -163,7 +160,7 @@ def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened) -> None:
     assert time.monotonic() - start < 1
 
 
-def test_CameraFeed__refuses_images_of_different_times(opened) -> None:
+def test_CameraFeed__refuses_images_of_different_times(opened):
     feed, (a, b) = opened(1, 0, timeout=0.7)
     a.end()
     Timer(0.6, b.deliver).start()
@@ -174,7 +171,7 @@ def test_CameraFeed__refuses_images_of_different_times(opened) -> None:
 
 
 @pytest.mark.slow
-def test_CameraFeed__is_closed_when_the_interpreter_ends() -> None:
+def test_CameraFeed__is_closed_when_the_interpreter_ends():
     """A thread that executes library code after the end of the interpreter aborts the process."""
     script = """
 from threading import Event

@@ -1,9 +1,6 @@
 """`morgs-mi live`: from sources to a stream with a summary, its end, and what it refuses."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -20,7 +17,7 @@ from tests.scenes import noise_capture
 
 
 @pytest.fixture
-def videos(tmp_path: Path) -> list[Path]:
+def videos(tmp_path):
     """Videos of half a second, which are played at their own speed, one per camera."""
     paths = [tmp_path / "videos" / f"{name}.mkv" for name in noise_capture.NAMES]
     for path in paths:
@@ -29,9 +26,7 @@ def videos(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_Live__fits_videos_until_they_end(
-    capture, tmp_path: Path, videos: list[Path], run, monkeypatch, caplog
-) -> None:
+def test_Live__fits_videos_until_they_end(capture, tmp_path, videos, run, monkeypatch, caplog):
     """The viewer starts at a provisional first frame."""
     out = tmp_path / "out"
     calls = []
@@ -58,9 +53,7 @@ def test_Live__fits_videos_until_they_end(
     assert names == {"stream.morgs", "report.json", "capture.json", "capture"}
 
 
-def test_Live__ends_with_a_summary_on_ctrl_c(
-    capture: Path, tmp_path: Path, videos, run, monkeypatch
-) -> None:
+def test_Live__ends_with_a_summary_on_ctrl_c(capture, tmp_path, videos, run, monkeypatch):
     monkeypatch.setattr(_Lines, "add", interrupt)
     status, printed, error = run(
         "live", tmp_path / "out", "--camera", *videos, "--calibration", capture, *OPTIONS
@@ -77,7 +70,7 @@ def test_Live__ends_with_a_summary_on_ctrl_c(
         (("--timeout", 1e18), "--timeout must be above 0 and at most 1000000, got 1e+18"),
     ],
 )
-def test_Live__refuses_in_one_sentence(capture: Path, tmp_path: Path, run, args, part) -> None:
+def test_Live__refuses_in_one_sentence(capture, tmp_path, run, args, part):
     assert_refused(run("live", tmp_path / "out", "--calibration", capture, *args), part)
     assert not (tmp_path / "out").exists()
 
@@ -90,7 +83,7 @@ def test_Live__refuses_in_one_sentence(capture: Path, tmp_path: Path, run, args,
         (LiveSettings(preset="s"), 30, 5),
     ],
 )
-def test_Live__names_the_output_after_the_time(monkeypatch, settings, seconds, epochs) -> None:
+def test_Live__names_the_output_after_the_time(monkeypatch, settings, seconds, epochs):
     fit = Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr("morgs_mi.extras.live.fit_live.fit_live", fit)
     with pytest.raises(KeyboardInterrupt):
@@ -101,7 +94,7 @@ def test_Live__names_the_output_after_the_time(monkeypatch, settings, seconds, e
     assert (config.fit.first_frame_seconds, config.fit.epochs) == (seconds, epochs)
 
 
-def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch):
     printed = []
     clock = 100.0
     monkeypatch.setattr(module, "print_warning", printed.append)
@@ -116,7 +109,7 @@ def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.Mo
     ]
 
 
-def test_summary__has_means_of_the_later_frames(tmp_path: Path) -> None:
+def test_summary__has_means_of_the_later_frames(tmp_path):
     (tmp_path / "stream.morgs").write_bytes(b"x" * 2_340_000)
     rows = [
         LiveFrame(0, 0, 30, 0.001, 0),

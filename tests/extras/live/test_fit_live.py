@@ -2,15 +2,9 @@
 that are not.
 """
 
-from __future__ import annotations
-
 import json
 from collections import deque
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
-from threading import Event
-from typing import Any
 from unittest.mock import Mock
 
 import cv2
@@ -37,22 +31,22 @@ from tests.scenes.live_clip import (
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Path:
+def rig(tmp_path):
     """The calibration of the cameras."""
     return write_calibration(tmp_path / "rig")
 
 
 @pytest.fixture
-def videos(tmp_path: Path) -> list[Path]:
+def videos(tmp_path):
     return write_videos(tmp_path / "videos")
 
 
 @pytest.fixture
-def cameras(monkeypatch: pytest.MonkeyPatch) -> list[deque[np.ndarray]]:
+def cameras(monkeypatch):
     """The images that the cameras of this machine deliver next, for the sources 0 to 3."""
     queues = [deque[np.ndarray]() for _ in NAMES]
 
-    def read(source: int, closed: Event, *_: object) -> Iterator[np.ndarray | None]:
+    def read(source, closed, *_):
         while not closed.wait(0.01):
             yield queues[source].popleft() if queues[source] else None
 
@@ -60,14 +54,12 @@ def cameras(monkeypatch: pytest.MonkeyPatch) -> list[deque[np.ndarray]]:
     return queues
 
 
-def packets(path: Path) -> list[bytes]:
+def packets(path):
     return [packet.encoded for packet in StreamReader(path / "stream.morgs")]
 
 
 @pytest.mark.slow
-def test_fit_live__follows_videos_at_their_speed(
-    tmp_path: Path, rig: Path, videos: list[Path]
-) -> None:
+def test_fit_live__follows_videos_at_their_speed(tmp_path, rig, videos):
     out = tmp_path / "out"
     grown = []
     live = LiveConfig(rig, downscale=4, frames=4, loop=True)
@@ -93,12 +85,7 @@ def test_fit_live__follows_videos_at_their_speed(
     assert packets(out) == packets(tmp_path / "again")
 
 
-def deliver(
-    cameras: list[deque[np.ndarray]],
-    number: int,
-    names: Sequence[str] = NAMES,
-    **sizes: tuple[int, int],
-) -> None:
+def deliver(cameras, number, names=NAMES, **sizes):
     """Let cameras deliver an image, at the sizes that are given and otherwise the recorded one."""
     for name, camera, clip in zip(NAMES, cameras, clips(), strict=True):
         if name in names:
@@ -107,13 +94,13 @@ def deliver(
 
 @pytest.mark.slow
 def test_fit_live__leaves_out_images_of_another_size_and_a_camera_that_stops(
-    tmp_path: Path, rig: Path, cameras: list[deque[np.ndarray]], caplog
-) -> None:
+    tmp_path, rig, cameras, caplog
+):
     """cam2 changes the size of its images in frame 1, cam1 stops after it."""
     deliver(cameras, 0)
     live = LiveConfig(rig, downscale=4, frames=3, timeout=2, warm_up=0)
 
-    def deliver_next(row, _) -> None:
+    def deliver_next(row, _):
         if row.frame == 0:
             deliver(cameras, 1, cam2=(100, 75))
         else:
@@ -129,9 +116,7 @@ def test_fit_live__leaves_out_images_of_another_size_and_a_camera_that_stops(
 
 
 @pytest.mark.slow
-def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(
-    tmp_path: Path, rig: Path, videos: list[Path]
-) -> None:
+def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(tmp_path, rig, videos):
     live = LiveConfig(rig, without=("cam1",), downscale=4, frames=1)
     fit_live([videos[0], *videos[2:]], tmp_path / "out", live, CONFIG)
     assert load_capture(tmp_path / "out" / "capture").names == ("cam0", "cam2", "cam3")
@@ -139,7 +124,7 @@ def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(
 
 
 @pytest.mark.slow
-def test_fit_live__calibrates_the_cameras_once(tmp_path: Path, videos: list[Path]) -> None:
+def test_fit_live__calibrates_the_cameras_once(tmp_path, videos):
     live = LiveConfig(seconds=1, record=False, loop=True)
     rows = fit_live(videos, tmp_path / "out", live, CONFIG)
     assert len(rows) >= 2
@@ -150,10 +135,8 @@ def test_fit_live__calibrates_the_cameras_once(tmp_path: Path, videos: list[Path
 
 
 @pytest.mark.slow
-def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(
-    tmp_path: Path, rig: Path, videos: list[Path]
-) -> None:
-    def interrupt(row, report) -> None:
+def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path, rig, videos):
+    def interrupt(row, report):
         if row.frame == 1:
             raise KeyboardInterrupt
 
@@ -162,7 +145,7 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(
     assert len(rows) == len(packets(tmp_path / "out")) == 2
     assert open_stream(tmp_path / "out").closed()
 
-    def interrupt_first(stage: str, done: int, total: int) -> None:
+    def interrupt_first(stage, done, total):
         if stage == "First frame" and done:
             raise KeyboardInterrupt
 
@@ -171,9 +154,7 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(
 
 
 @pytest.mark.slow
-def test_fit_live__ends_with_a_reason(
-    tmp_path: Path, rig: Path, cameras: list[deque[np.ndarray]], caplog
-) -> None:
+def test_fit_live__ends_with_a_reason(tmp_path, rig, cameras, caplog):
     """Without further images, and with an error when a frame cannot be written."""
     deliver(cameras, 0)
     live = LiveConfig(rig, downscale=4, timeout=0.2, warm_up=0)
@@ -189,7 +170,7 @@ def test_fit_live__ends_with_a_reason(
     assert len(packets(tmp_path / "full")) == 1
 
 
-def deliver_black(cameras: list[deque[np.ndarray]]) -> None:
+def deliver_black(cameras):
     """Let cameras deliver a black image, one of another shape."""
     for camera, width in zip(cameras, (120, 120, 90, 120), strict=True):
         camera.append(np.zeros((90, width, 3), np.uint8))
@@ -207,15 +188,13 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("sources", "message"), FAULTS)
-def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, sources, message: str) -> None:
+def test_fit_live__names_what_is_wrong(tmp_path, rig, sources, message):
     with pytest.raises((ValueError, OSError), match=message):
         fit_live(sources, tmp_path / "out", LiveConfig(rig, timeout=0.2), CONFIG)
     assert not (tmp_path / "out").exists()
 
 
-def test_fit_live__refuses_images_of_another_shape(
-    tmp_path: Path, rig: Path, cameras: list[deque[np.ndarray]]
-) -> None:
+def test_fit_live__refuses_images_of_another_shape(tmp_path, rig, cameras):
     deliver_black(cameras)
     with pytest.raises(
         ValueError, match=r"expected 200x150, the calibrated size of cam2, .* of it, got 90x90"
@@ -224,9 +203,7 @@ def test_fit_live__refuses_images_of_another_shape(
     assert not (tmp_path / "out").exists()
 
 
-def test_fit_live__keeps_images_that_cannot_be_calibrated(
-    tmp_path: Path, cameras: list[deque[np.ndarray]]
-) -> None:
+def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path, cameras):
     deliver_black(cameras)
     with pytest.raises(
         ValueError, match="expected at least 100 features in every view, got 0 in cam"
@@ -239,9 +216,7 @@ def test_fit_live__keeps_images_that_cannot_be_calibrated(
     assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()
 
 
-def test_fit_live__can_be_started_again_after_a_full_disk(
-    tmp_path: Path, rig: Path, cameras: list[deque[np.ndarray]]
-) -> None:
+def test_fit_live__can_be_started_again_after_a_full_disk(tmp_path, rig, cameras):
     sizes = [len(png_bytes(clip[0])) for clip in clips()]
     assert (rig / "sparse" / "0" / "points3D.txt").stat().st_size > max(sizes)
     live = LiveConfig(rig, timeout=0.2, warm_up=0)
@@ -254,7 +229,7 @@ def test_fit_live__can_be_started_again_after_a_full_disk(
         assert not (tmp_path / "out").exists()
 
 
-def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path) -> None:
+def test_fit_live__does_not_replace_an_earlier_capture(tmp_path, rig):
     (tmp_path / "out" / "capture").mkdir(parents=True)
     with pytest.raises(FileExistsError, match="got that of an earlier fit; choose another folder"):
         fit_live([0], tmp_path / "out", LiveConfig(rig), CONFIG)
@@ -275,8 +250,6 @@ def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path
         ({"frames": 0}, "`frames` must be at least 1, got 0"),
     ],
 )
-def test_fit_live__refuses_settings_out_of_range(
-    tmp_path: Path, rig: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_fit_live__refuses_settings_out_of_range(tmp_path, rig, changes, message):
     with pytest.raises(ValueError, match=message):
         fit_live([0], tmp_path / "out", replace(LiveConfig(rig), **changes))

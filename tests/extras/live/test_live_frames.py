@@ -2,8 +2,6 @@
 loop.
 """
 
-from __future__ import annotations
-
 import re
 from itertools import islice
 from pathlib import Path
@@ -13,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.extras.live.sources import live_frames
@@ -25,7 +23,7 @@ NAMES = ("cam1", "cam2", "cam3")
 
 
 @pytest.fixture
-def rig(tmp_path: Path, small_images: None) -> Capture:
+def rig(tmp_path, small_images):
     """Three cameras at half size, the second with lens distortion."""
     lenses = [Lens(), Lens("SIMPLE_RADIAL", (0.2,)), Lens()]
     write_colmap(tmp_path / "rig/sparse/0", layouts.rig(NAMES), lenses=lenses)
@@ -34,23 +32,23 @@ def rig(tmp_path: Path, small_images: None) -> Capture:
     return load_capture(tmp_path / "rig", downscale=2)
 
 
-def clip() -> list[np.ndarray]:
+def clip():
     size = (3, layouts.HEIGHT, layouts.WIDTH, 3)
     return list(np.random.default_rng(3).integers(0, 256, size, np.uint8))
 
 
-def assert_as_recorded(rig: Capture, frames) -> None:
+def assert_as_recorded(rig, frames):
     for live, recorded in zip(frames, rig.frames(), strict=True):
         assert live.index == recorded.index
         for a, b in zip(live.images, recorded.images, strict=True):
             np.testing.assert_array_equal(a, b)
 
 
-def test_live_frames__process_iterators_and_files_like_clips(rig: Capture) -> None:
+def test_live_frames__process_iterators_and_files_like_clips(rig):
     assert_as_recorded(rig, live_frames(rig, [iter(clip()), clip(), rig.path / "cam3.mkv"]))
 
 
-def test_live_frames__leave_out_a_source_that_misses_a_timestamp_or_ends(rig: Capture) -> None:
+def test_live_frames__leave_out_a_source_that_misses_a_timestamp_or_ends(rig):
     a, b, c = clip()
     frames = list(live_frames(rig, [[a, None, c], [a, b], clip()]))
     assert [[image is not None for image in frame.images] for frame in frames] == [
@@ -61,7 +59,7 @@ def test_live_frames__leave_out_a_source_that_misses_a_timestamp_or_ends(rig: Ca
     assert [frame.problems for frame in frames] == [(), ("cam1: no image",), ("cam2: no image",)]
 
 
-def test_live_frames__read_an_endless_source(rig: Capture) -> None:
+def test_live_frames__read_an_endless_source(rig):
     def endless():
         while True:
             yield clip()[0]
@@ -90,12 +88,12 @@ def test_live_frames__read_an_endless_source(rig: Capture) -> None:
         ),
     ],
 )
-def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: str) -> None:
+def test_live_frames__refuse_bad_sources(rig, sources, error, message):
     with pytest.raises(error, match=message):
         list(live_frames(rig, sources))
 
 
-def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_page__loop_runs(rig, monkeypatch):
     """The loop over live frames in docs/live.md, with clips in place of connections."""
     text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)

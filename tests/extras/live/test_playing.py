@@ -1,9 +1,6 @@
 """Videos that are played side by side: at their speed, at one time, again and again."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from threading import Event, Thread
@@ -17,19 +14,19 @@ from morgs_mi.extras.live.sources import ClipClock, is_video, open_feed, play
 from morgs_mi.io.video_writer import write_video
 
 
-def clip(path: Path, count: int, fps: float = 50) -> Path:
+def clip(path, count, fps=50):
     """Write a video of grey images, each ten levels brighter than the one before."""
     write_video(path, [np.full((16, 16, 3), 10 * k, np.uint8) for k in range(count)], fps)
     return path
 
 
-def played(paths: list[Path], count: int, loop: bool) -> list[np.ndarray]:
+def played(paths, count, loop):
     """Return the time and the number [count, 2] of the first images of each clip."""
     clock = ClipClock(len(paths))
     rows = [[] for _ in paths]
     start = time.monotonic()
 
-    def read(k: int) -> None:
+    def read(k):
         for image in islice(play(paths[k], clock, Event(), k, loop), count):
             rows[k].append((time.monotonic() - start, int(image[0, 0, 0]) // 10))
 
@@ -41,7 +38,7 @@ def played(paths: list[Path], count: int, loop: bool) -> list[np.ndarray]:
     return [np.array(each) for each in rows]
 
 
-def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
+def test_play__plays_a_clip_once_at_its_own_speed(tmp_path):
     (rows,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
     times, numbers = rows.T
     assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
@@ -49,7 +46,7 @@ def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
     assert np.all(np.diff(times) > 0.02), "not all at once"
 
 
-def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None:
+def test_play__repeats_clips_together_after_the_shortest(tmp_path):
     lengths = ((6, 50), (9, 50), (5, 25))
     paths = [clip(tmp_path / f"{count}.mkv", count, fps) for count, fps in lengths]
     times, numbers = np.moveaxis(played(paths, 20, loop=True), 2, 0)
@@ -62,8 +59,8 @@ def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None
     assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.019, "within an interval"
 
 
-def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
-    def timed(path: Path) -> Iterator[tuple[np.ndarray, float, float]]:
+def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch):
+    def timed(path):
         for k in range(20):
             time.sleep(0.02 * (path.name == "slow"))
             yield np.full((2, 2, 3), 10 * k, np.uint8), k / 100, 1 / 100
@@ -75,7 +72,7 @@ def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.Monke
     assert (slow[2:, 0] > fast[:-2, 0]).all()
 
 
-def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
+def test_play__ends_when_it_is_closed(tmp_path):
     """Also while it waits for another clip, which has not begun."""
     closed = Event()
     reader = Thread(
@@ -91,13 +88,13 @@ def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
     assert not reader.is_alive()
 
 
-def test_play__refuses_what_has_no_image(tmp_path: Path) -> None:
+def test_play__refuses_what_has_no_image(tmp_path):
     (tmp_path / "text.mkv").write_text("no video")
     with pytest.raises(OSError, match=r"text.mkv: expected a video, got 8 bytes"):
         next(play(tmp_path / "text.mkv", ClipClock(), Event()))
 
 
-def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
+def test_is_video__is_not_the_description_of_a_stream(tmp_path):
     paths = [tmp_path / name for name in ("clip.mp4", "cam.sdp")]
     for path in paths:
         path.touch()
@@ -105,7 +102,7 @@ def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
     assert [is_video(source) for source in sources] == [True, False, False, False, False]
 
 
-def test_open_feed__repeats_videos_alone() -> None:
+def test_open_feed__repeats_videos_alone():
     with pytest.raises(
         ValueError,
         match=r"`loop` repeats videos, got none in 2 \(0, rtsp://10.0.0.10/live\); leave it",
@@ -114,7 +111,7 @@ def test_open_feed__repeats_videos_alone() -> None:
 
 
 @pytest.mark.parametrize("loop", [False, True])
-def test_open_feed__of_videos_begins_with_their_first_images(tmp_path: Path, loop: bool) -> None:
+def test_open_feed__of_videos_begins_with_their_first_images(tmp_path, loop):
     feed = open_feed(
         [clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop)
     )

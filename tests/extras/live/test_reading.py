@@ -1,7 +1,5 @@
 """Images of connections and cameras of this machine as they arrive."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from itertools import islice
 from threading import Event
@@ -9,7 +7,6 @@ from unittest.mock import Mock, call
 
 import cv2
 import numpy as np
-import pytest
 
 from morgs_mi.extras.live import sources as module
 from morgs_mi.extras.live.sources import read_camera
@@ -18,7 +15,7 @@ from tests.scenes.live_clip import connection
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 
 
-def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_camera__opens_a_broken_connection_again(monkeypatch):
     monkeypatch.setattr(module, "PAUSE", 0)
     monkeypatch.setattr(module, "RETRY", 0)
     url = "rtsp://10.0.0.10/live"
@@ -38,9 +35,7 @@ def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.Monkey
     assert list(closing) == []
 
 
-def test_read_camera__requests_the_size_of_a_camera_of_this_machine(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_read_camera__requests_the_size_of_a_camera_of_this_machine(monkeypatch):
     camera = connection(IMAGE + np.array([1, 2, 3], np.uint8))
     monkeypatch.setattr(cv2, "VideoCapture", lambda source: camera)
     images = read_camera(0, Event(), (640, 480))

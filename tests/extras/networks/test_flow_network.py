@@ -1,7 +1,5 @@
 """Flow networks: order, channels, range, padding and scale of inputs and outputs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

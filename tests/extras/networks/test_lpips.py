@@ -1,7 +1,5 @@
 """LPIPS: inputs and outputs of a network, and errors for unsuitable ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

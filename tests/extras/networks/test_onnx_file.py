@@ -1,11 +1,8 @@
 """Networks in ONNX files: inputs and outputs, hostile files, and the image as an input."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -42,7 +39,7 @@ def test_onnx_network__names_the_extra_that_is_missing(tmp_path, monkeypatch):
         OnnxNetwork(export(tmp_path / "a.onnx"))
 
 
-def with_weights_at(path: Path, location: str) -> Path:
+def with_weights_at(path, location):
     """Write a network that adds weights in a further file at `location`."""
     graph = f"sum (float[{VALUES}] x) => (float[{VALUES}] y) {{ y = Add(x, w) }}"
     model = onnx.load(write(path, graph, w=np.zeros(VALUES, np.float32)))
@@ -74,7 +71,7 @@ def test_onnx_network__reads_no_weights_outside_its_folder(tmp_path, location):
         OnnxNetwork(path)
 
 
-def endless_number(path: Path) -> None:
+def endless_number(path):
     path.write_bytes(b"\x08" + b"\xff" * 2_000_000 + b"\x01")
 
 

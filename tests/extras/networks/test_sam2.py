@@ -1,7 +1,5 @@
 """SAM2: inputs of its two networks, and the mask from their outputs."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -2,10 +2,6 @@
 the prompts.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from tests.scenes.tiny_network import write
@@ -19,7 +15,7 @@ MEAN = np.array([0.485, 0.456, 0.406])
 DEVIATION = np.array([0.229, 0.224, 0.225])
 
 
-def export_encoder(path: Path, open_size: bool = False) -> Path:
+def export_encoder(path, open_size=False):
     """Write an encoder with the image itself as features, at a quarter, an eighth and a sixteenth
     of its side.
     """
@@ -37,7 +33,7 @@ def export_encoder(path: Path, open_size: bool = False) -> Path:
     return write(path, graph)
 
 
-def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
+def export_decoder(path, extra="", scale=1.0):
     """Write a decoder that returns three masks, of which the second is the correct one.
 
     It contains the pixels that are redder than blue by more than 0.2, inside the box (the first two

@@ -2,8 +2,6 @@
 there are not made again. Parts are left out alone and together.
 """
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace

@@ -1,9 +1,5 @@
 """A tiny capture and one path tracer, shared by the tests of this subpackage."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from morgs_mi.extras.synth.path_tracer import PathTracer
@@ -13,13 +9,13 @@ from morgs_mi.extras.synth.synthesize import synthesize
 
 
 @pytest.fixture(scope="session")
-def tracer() -> PathTracer:
+def tracer():
     """The scene `spheres`, at the time that the previous test has set."""
     return PathTracer(load_scene("spheres"))
 
 
 @pytest.fixture(scope="session")
-def clip(tmp_path_factory) -> Path:
+def clip(tmp_path_factory):
     """The scene `arm` from 3 cameras, 3 frames of 64x48, with lossless frames."""
     out = tmp_path_factory.mktemp("synth") / "arm"
     return synthesize(

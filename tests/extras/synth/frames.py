@@ -1,18 +1,11 @@
 """Rendered frames with their ground truth."""
 
-from __future__ import annotations
-
-import numpy as np
-
-from morgs_mi.capture.truth import GroundTruth
-from morgs_mi.core.camera import Camera
 from morgs_mi.extras.synth.ground_truth import compute_ground_truth
-from morgs_mi.extras.synth.path_tracer import PathTracer
 
 FPS = 30.0
 
 
-def render_frame(tracer: PathTracer, camera: Camera, frame: int) -> tuple[np.ndarray, GroundTruth]:
+def render_frame(tracer, camera, frame):
     """Return the image and the ground truth of a frame."""
     time = frame / FPS
     tracer.set_time(time)

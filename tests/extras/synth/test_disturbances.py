@@ -2,10 +2,7 @@
 states.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -37,7 +34,7 @@ ALL = Disturbances(0.5, 0.4, 0.1)
 SIZE = SynthConfig(cameras=2, frames=2, width=64, height=48, spp=4)
 
 
-def test_draw_disturbances__stays_within_its_bounds_and_leaves_the_reference_alone() -> None:
+def test_draw_disturbances__stays_within_its_bounds_and_leaves_the_reference_alone():
     drawn = draw_disturbances(ALL, 200, seed=1)
     offsets = np.array([d.time_offset for d in drawn])
     assert offsets[0] == 0
@@ -47,7 +44,7 @@ def test_draw_disturbances__stays_within_its_bounds_and_leaves_the_reference_alo
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Disturbances)])
-def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -> None:
+def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name):
     every = draw_disturbances(ALL, 3, 0)
     one = draw_disturbances(Disturbances(**{name: getattr(ALL, name)}), 3, 0)
     nothing = CameraDisturbance(0, 0, 0)
@@ -55,20 +52,20 @@ def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -
     assert one != (nothing,) * 3
 
 
-def test_row_times__surround_the_time_of_the_frame() -> None:
+def test_row_times__surround_the_time_of_the_frame():
     camera = CameraDisturbance(0.25, 0.5, 0.0)
     times = camera.row_times(3, 48)
     assert_close(times.mean(), 3.25, atol=1e-12)
     assert_close(np.diff(times), np.full(47, 0.5 / 48), atol=1e-12)
 
 
-def test_load_disturbances__reads_back_what_was_saved(tmp_path: Path) -> None:
+def test_load_disturbances__reads_back_what_was_saved(tmp_path):
     drawn = dict(zip(("cam00", "cam01"), draw_disturbances(ALL, 2, 0), strict=True))
     save_disturbances(tmp_path, drawn)
     assert load_disturbances(tmp_path) == drawn
 
 
-def test_load_disturbances__names_a_missing_or_broken_file(tmp_path: Path) -> None:
+def test_load_disturbances__names_a_missing_or_broken_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"disturbances\.json"):
         load_disturbances(tmp_path)
     for text in (
@@ -84,7 +81,7 @@ def test_load_disturbances__names_a_missing_or_broken_file(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("k", [-0.3, 0.4])
-def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
+def test_undistorted__is_the_inverse_of_the_lens(k):
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 50, 64, 48)
     pixels = np.random.default_rng(0).uniform(0, (64, 48), (50, 2))
     there = undistorted(camera, Lens("SIMPLE_RADIAL", (k,)), pixels)
@@ -95,7 +92,7 @@ def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
 
 
 @pytest.mark.slow
-def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path: Path) -> None:
+def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path):
     """The motion of a camera's truth leads between its own times; tracks are at the reference's
     times.
     """
@@ -120,7 +117,7 @@ def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path:
     assert_close(points[:, 1], points[:, 0] @ step[:3, :3].T + step[:3, 3], atol=1e-6)
 
 
-def bar_scene(speed: float) -> Scene:
+def bar_scene(speed):
     """A bright vertical bar that moves along x, in front of nothing, in constant light."""
     bar = Object(
         {"bar": box((0, 0, 0), (0.1, 3, 0.02), {"type": "diffuse", "reflectance": 0.8})},
@@ -132,7 +129,7 @@ def bar_scene(speed: float) -> Scene:
 
 
 @pytest.mark.slow
-def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path: Path) -> None:
+def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path):
     """A vertical bar is slanted: in every row, its middle is where the bar is at the time of that
     row.
     """
@@ -145,7 +142,7 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
     expected = scene.rig.cameras(2, 128, 64)[0].project(bar)[0][:, 0]
     assert np.ptp(expected) > 5
 
-    def middle(rows: np.ndarray) -> np.ndarray:
+    def middle(rows):
         return (rows * (np.arange(128) + 0.5)).sum(axis=1) / rows.sum(axis=1)
 
     image = list(open_frames(clip / "frames/cam00").frames())[1]
@@ -156,7 +153,7 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
 
 
 @pytest.mark.slow
-def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_path: Path) -> None:
+def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_path):
     disturbances = Disturbances(distortion=0.4)
     config = replace(SIZE, width=96, height=72, spp=16, frames=1, disturbances=disturbances)
     clip = synthesize("spheres", tmp_path / "clip", config)
@@ -180,7 +177,7 @@ def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_pat
     assert_close(capture.cameras[1].K, camera.K, atol=1e-6)
 
 
-def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> None:
+def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path):
     scene = bar_scene(0.0)
     wide = Scene("wide", scene.objects, scene.lights, Rig(center=(0, 0, 0), fov=80, elevation=0))
     with pytest.raises(
@@ -193,7 +190,7 @@ def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> No
         )
 
 
-def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path: Path) -> None:
+def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path):
     """A pose that fails before 0 s, when a rolling shutter reads the first rows."""
     late = bar_scene(0.0).objects["bar"].shapes
     scene = Scene("late", {"bar": Object(late, lambda t: translate(1 / (t >= 0), 0, 0))}, {}, Rig())

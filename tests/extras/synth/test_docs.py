@@ -1,7 +1,5 @@
 """The example of docs/scenes.md is rendered as the page describes."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields
 from pathlib import Path
@@ -20,7 +18,7 @@ TEXT = (Path(__file__).parents[3] / "docs" / "scenes.md").read_text(encoding="ut
 
 
 @pytest.mark.slow
-def test_scenes_page__example_is_rendered_with_its_moving_ball(tmp_path: Path) -> None:
+def test_scenes_page__example_is_rendered_with_its_moving_ball(tmp_path):
     (tmp_path / "ball.py").write_text(SCENE)
     size = SynthConfig(cameras=2, frames=2, width=64, height=48, spp=4)
     truth = load_truth(
@@ -36,9 +34,7 @@ COMMANDS = [line.split() for line in re.findall(r"^    morgs-mi (synth .+)", TEX
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [c for c in COMMANDS if "ball.py" not in c[1]], ids=" ".join)
-def test_scenes_page__commands_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
-) -> None:
+def test_scenes_page__commands_run(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     assert main([*command, *SMALL]) == 0
@@ -50,7 +46,7 @@ def test_scenes_page__commands_run(
 
 
 @pytest.mark.slow
-def test_scenes_page__lists_the_files_of_a_capture(clip: Path) -> None:
+def test_scenes_page__lists_the_files_of_a_capture(clip):
     listed = {
         name.split("/")[0]
         for name in re.findall(r"^\| (.+?) \|", TEXT, re.MULTILINE)

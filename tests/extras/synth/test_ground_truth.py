@@ -1,7 +1,5 @@
 """The ground truth against independent computations."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -27,7 +25,7 @@ def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_curr
     assert (truth.motion[~truth.mask] == 0).all()
     grid = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1).astype(np.float32)
 
-    def warped(values: np.ndarray, motion: np.ndarray, interpolation: int) -> np.ndarray:
+    def warped(values, motion, interpolation):
         return cv2.remap(values, grid - motion, None, interpolation)
 
     # Visible in both frames: the source and its neighbours belong to the same object.

@@ -1,7 +1,5 @@
 """The path tracer: rays, encoding, and noise."""
 
-from __future__ import annotations
-
 import mitsuba as mi
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Random scenes: what the seed draws, without rendering, and one small clip."""
 
-from __future__ import annotations
-
 import json
 from itertools import combinations
 
@@ -14,7 +12,7 @@ from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.testing import assert_close
 
 # Not tests.scenes.
-from scenes.random import MOTIONS, Body, RandomScene, draw_scene  # pyright: ignore[reportMissingImports]
+from scenes.random import MOTIONS, draw_scene  # pyright: ignore[reportMissingImports]
 
 NUM_SEEDS = 50
 FPS = 30.0
@@ -23,7 +21,7 @@ SMALL = SynthConfig(frames=2, width=64, height=48, seed=1)
 
 
 @pytest.fixture(scope="module")
-def scenes() -> list[RandomScene]:
+def scenes():
     return [draw_scene(seed) for seed in range(NUM_SEEDS)]
 
 
@@ -32,14 +30,14 @@ def clip(tmp_path_factory):
     return synthesize("random", tmp_path_factory.mktemp("synth") / "random", SMALL)
 
 
-def thin_and_fast(scene: RandomScene) -> bool:
+def thin_and_fast(scene):
     return any(
         body.solid.kind == "rod" and body.motion != "static" and body.speed >= 7
         for body in scene.bodies.values()
     )
 
 
-def surface(body: Body, times: np.ndarray) -> np.ndarray:
+def surface(body, times):
     """Return points of the surface farthest from the object's centre, over time [T, P, 3]."""
     octahedron = body.solid.margin * np.concatenate([np.eye(3), -np.eye(3)])
     points = (body.solid.points[:, None] + octahedron).reshape(-1, 3)

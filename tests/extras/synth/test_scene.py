@@ -1,7 +1,5 @@
 """Scenes: files with a mistake, and what the scenes of this package show."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

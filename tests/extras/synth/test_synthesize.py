@@ -1,7 +1,5 @@
 """Synthetic captures: their files, and the scenes that are refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

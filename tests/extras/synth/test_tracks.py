@@ -1,9 +1,5 @@
 """Tracks: visibility against a known occluder, and their file."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,7 +11,7 @@ from morgs_mi.extras.synth.shapes import ball
 
 
 @pytest.mark.parametrize(("x", "expected"), [(0.0, [False, True]), (1.0, [True, True])])
-def test_sees__a_ball_hides_what_is_behind_it(x: float, expected: list[bool]) -> None:
+def test_sees__a_ball_hides_what_is_behind_it(x, expected):
     """Of two points on the axis, the ball at the origin hides the farther one, unless it is moved
     aside. Points behind the camera and outside its image are not seen.
     """
@@ -29,7 +25,7 @@ def test_sees__a_ball_hides_what_is_behind_it(x: float, expected: list[bool]) ->
 
 
 @pytest.mark.parametrize("visible", [{}, {"cam00": np.array([[True, False], [False, False]])}])
-def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path, visible) -> None:
+def test_save_tracks__load_tracks_reads_them_back(tmp_path, visible):
     tracks = Tracks(np.arange(12.0).reshape(2, 2, 3), np.array([1, 2], np.int32), visible)
     save_tracks(tmp_path, tracks)
     np.testing.assert_equal(vars(load_tracks(tmp_path)), vars(tracks))

@@ -1,7 +1,5 @@
 """Forward-backward check: which pixels pass, and what its two tolerances do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Flow from files: reading inverts writing, and errors name the file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -18,7 +16,7 @@ def random_flow(height=6, width=9, seed=0):
     return np.random.default_rng(seed).normal(0, 30, (height, width, 2)).astype(np.float32)
 
 
-def write_flow(path: Path, flow: np.ndarray) -> None:
+def write_flow(path, flow):
     """Write a flow as OpenCV does, or as an EXR file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".exr":

@@ -1,7 +1,5 @@
 """Optical flow and the flow observation: sign, grid, reliability."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

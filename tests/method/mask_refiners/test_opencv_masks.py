@@ -1,7 +1,5 @@
 """GrabCut and superpixels: objects from partial masks, any mask and size, repeatable results."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

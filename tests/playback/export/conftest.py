@@ -1,12 +1,7 @@
 """Fixtures of the tests in a browser."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
-from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.playback.export.web import write_web_page
 from morgs_mi.playback.streams import open_stream
 from tests.playback.export.pages import HEIGHT, WIDTH
@@ -14,7 +9,7 @@ from tests.scenes.changing_splats import rig, splats, write_stream
 
 
 @pytest.fixture(scope="module")
-def clip(tmp_path_factory) -> tuple[Path, list[CodedFrame]]:
+def clip(tmp_path_factory):
     """Return the folder of a stream and its page, with SH of degree 3, births and a death, and its
     states.
     """

@@ -1,12 +1,9 @@
 """Pages in headless Chromium, and a web server for them."""
 
-from __future__ import annotations
-
 import functools
 import http.server
 import shutil
 import threading
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,12 +20,12 @@ HIDDEN = "#bar, #legend, #message {visibility: hidden}"
 class Page:
     """A page with what it requested and what it reported."""
 
-    def __init__(self, browser, address: str, **context):
+    def __init__(self, browser, address, **context):
         options = {"viewport": {"width": WIDTH, "height": HEIGHT}, **context}
         self.page = browser.new_context(**options).new_page()
         self.page.set_default_timeout(TIMEOUT_MS)
-        self.errors: list[str] = []
-        self.requests: list[str] = []
+        self.errors = []
+        self.requests = []
         self.page.on(
             "console",
             lambda m: self.errors.append(m.text) if m.type in ("error", "warning") else None,
@@ -40,10 +37,10 @@ class Page:
     def __enter__(self):
         return self
 
-    def __exit__(self, *error) -> None:
+    def __exit__(self, *error):
         self.page.context.close()
 
-    def wait(self, condition: str) -> None:
+    def wait(self, condition):
         """Wait for a condition; wait_for_function() needs `eval`, which the player forbids."""
         for _ in range(TIMEOUT_MS // 50):
             if self.page.evaluate(condition):
@@ -51,10 +48,10 @@ class Page:
             self.page.wait_for_timeout(50)
         raise AssertionError(f"{condition} does not become true; {self.text('body')} {self.errors}")
 
-    def text(self, selector: str) -> str:
+    def text(self, selector):
         return self.page.locator(selector).inner_text()
 
-    def image(self) -> np.ndarray:
+    def image(self):
         """Return the image behind the controls."""
         style = self.page.add_style_tag(content=HIDDEN)
         image = cv2.cvtColor(
@@ -67,19 +64,19 @@ class Page:
 class served:
     """Serve a folder on this machine, as a context that returns its address."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder):
         handler = functools.partial(_Quiet, directory=str(folder))
         self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
 
-    def __enter__(self) -> str:
+    def __enter__(self):
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
         return f"http://127.0.0.1:{self.server.server_port}"
 
-    def __exit__(self, *error) -> None:
+    def __exit__(self, *error):
         self.server.shutdown()
         self.server.server_close()
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
+    def log_message(self, format, *args):
         pass

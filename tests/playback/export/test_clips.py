@@ -1,7 +1,5 @@
 """`morgs-mi export` and `render`: one file per frame and videos, through the command line."""
 
-from __future__ import annotations
-
 import json
 
 import cv2
@@ -34,7 +32,7 @@ def stream(tmp_path):
     return write_stream(tmp_path / "stream.morgs")
 
 
-def run(*args: object) -> int:
+def run(*args):
     return main([str(arg) for arg in args])
 
 

@@ -2,8 +2,6 @@
 Chromium.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from importlib.resources import files
@@ -47,7 +45,7 @@ def test_write_web_folder__contains_the_module_which_imports_only_three_and_spar
     assert len(code) < 30_000
 
 
-def example() -> str:
+def example():
     """Return the page of the documentation with the installed packages, at a given time."""
     page = re.search(
         r"```html\n(.*?)```", (ROOT / "docs/web-player.md").read_text(encoding="utf-8"), re.DOTALL
@@ -55,7 +53,7 @@ def example() -> str:
     assert page is not None
     lock = json.loads((ROOT / "web/package-lock.json").read_text(encoding="utf-8"))["packages"]
 
-    def local(address: re.Match) -> str:
+    def local(address):
         folder = f"node_modules/{address[1]}"
         assert lock[folder]["version"] == address[2]
         return f"./{folder}"
@@ -103,7 +101,7 @@ def site(clip, tmp_path_factory):
 class Scene(Page):
     """The example, paused."""
 
-    def show(self, frame: int, camera: int = 0) -> np.ndarray:
+    def show(self, frame, camera=0):
         """Return the image of a frame from a camera."""
         self.page.evaluate(
             f"time = {frame} / splats.fps; controls.target.copy(splats.place(camera, {camera}))"

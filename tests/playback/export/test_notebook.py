@@ -1,7 +1,5 @@
 """Streams and images in the output of a notebook's cell."""
 
-from __future__ import annotations
-
 import base64
 import html
 import re

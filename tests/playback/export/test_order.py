@@ -1,7 +1,5 @@
 """An order of the Gaussians by place that stays the same."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from morgs_mi.codec.container import StreamWriter
@@ -12,7 +10,7 @@ from morgs_mi.playback.export.clips import by_place
 from tests.scenes.changing_splats import rig, splats, write_stream
 
 
-def rows(gaussians) -> dict[bytes, int]:
+def rows(gaussians):
     """Return the place of each Gaussian in the order, by its base colour, which does not change."""
     return {color.tobytes(): k for k, color in enumerate(gaussians.numpy()["sh_coeffs"][:, 0])}
 

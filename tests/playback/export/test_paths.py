@@ -1,7 +1,5 @@
 """Camera paths: interpolation of key views, orbits, paths through the rig, JSON files."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -18,7 +16,7 @@ from tests.scenes.changing_splats import rig
 TARGET = np.array([0, 0, 0.2])
 
 
-def ring(count: int) -> tuple[Camera, ...]:
+def ring(count):
     origins = circle(2 * np.pi * np.arange(count) / count, 3, 1)
     return tuple(look_at_cameras(origins, 45, target=(0, 0, 0.2), up=(0, 0, 1)))
 

@@ -2,8 +2,6 @@
 network.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.cli.main import main
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from morgs_mi.io.ply import read_ply, write_ply
 from morgs_mi.io.splats import read_splats
@@ -27,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def program() -> str:
+def program():
     """Return the program with its version, as the page names it."""
     (name,) = set(re.findall(r"npx --yes (\S+)", PAGE))
     if shutil.which("npx") is None:
@@ -39,13 +36,13 @@ def program() -> str:
     return name
 
 
-def convert(program: str, *files: Path) -> None:
+def convert(program, *files):
     subprocess.run(
         ["npx", "--yes", program, "-g", "cpu", *map(str, files)], check=True, timeout=300
     )
 
 
-def assert_same(original: Gaussians, converted: Gaussians, atol: float) -> None:
+def assert_same(original, converted, atol):
     """Compare Gaussians in any order; quaternions up to their sign and length."""
     columns = []
     for gaussians in (original, converted):

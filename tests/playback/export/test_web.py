@@ -2,8 +2,6 @@
 streams.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import re
@@ -17,7 +15,6 @@ from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import (
-    CodedFrame,
     coded_frames,
     decode,
     keyframe_packet,
@@ -49,7 +46,7 @@ FRAMES = 4
 # --------------------------------------------------------------------------------------------------
 
 
-def bytes_of_text(text: str, count: int) -> bytes:
+def bytes_of_text(text, count):
     """Return the bytes as a reader of the page does."""
     bits = "".join(f"{ord(character) & 127:07b}" for character in text)
     return bytes(int(bits[8 * i : 8 * i + 8], 2) for i in range(count))
@@ -159,14 +156,14 @@ def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
 class Player(Page):
     """A page of the player."""
 
-    def __init__(self, browser, address: str, expected: str | None = None, **context):
+    def __init__(self, browser, address, expected=None, **context):
         super().__init__(browser, address, **context)
         if expected is None:
             self.wait("!!window.player && player.settled")
         else:
             self.page.get_by_text(expected).wait_for()
 
-    def show(self, frame: int) -> None:
+    def show(self, frame):
         self.page.evaluate(f"player.playback.seek({frame})")
         self.wait(f"player.playback.position === {frame} && player.settled")
 
@@ -194,7 +191,7 @@ def page(opened):
     assert elsewhere == [opened.page.url.split("#")[0]]
 
 
-def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
+def decodes(page, position, coded):
     """Return whether the page decodes a position to the integers of a state."""
     values = page.page.evaluate(
         """async (position) => {
@@ -359,7 +356,7 @@ AT_REST = """new Promise((resolve) => {
 })"""
 
 
-def drag(page: Player, pixels: int) -> float:
+def drag(page, pixels):
     """Return the angle in degrees from the view at rest after a drag to the nearest camera."""
     page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
     page.page.mouse.down()

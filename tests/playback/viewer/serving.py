@@ -1,13 +1,9 @@
 """A viewer in a thread, and requests to it."""
 
-from __future__ import annotations
-
 import json
 import socket
-from collections.abc import Iterator
 from contextlib import contextmanager
-from http.client import HTTPConnection, HTTPResponse
-from pathlib import Path
+from http.client import HTTPConnection
 from threading import Thread
 from urllib.parse import urlencode, urlsplit
 
@@ -21,7 +17,7 @@ from morgs_mi.playback.viewer.server import Viewer
 
 
 @contextmanager
-def viewing(path: Path, **options) -> Iterator[str]:
+def viewing(path, **options):
     """Serve a stream, or a file of Gaussians, and yield the link."""
     viewer = Viewer(open_stream(path), **options)
     thread = Thread(target=viewer.run)
@@ -34,7 +30,7 @@ def viewing(path: Path, **options) -> Iterator[str]:
         assert not thread.is_alive()
 
 
-def get(url: str, path: str = "", **headers: str) -> tuple[HTTPResponse, bytes]:
+def get(url, path="", **headers):
     """Return the answer to a request, and its content; the path is sent as it is."""
     parts = urlsplit(url)
     connection = HTTPConnection("127.0.0.1", parts.port, timeout=120)
@@ -49,7 +45,7 @@ def get(url: str, path: str = "", **headers: str) -> tuple[HTTPResponse, bytes]:
     return response, content
 
 
-def raw(url: str, *lines: str) -> str:
+def raw(url, *lines):
     """Return the first line and the body of the answer to hand-made lines."""
     with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=60) as connection:
         connection.sendall("\r\n".join([*lines, "Connection: close", "", ""]).encode())
@@ -58,13 +54,13 @@ def raw(url: str, *lines: str) -> str:
     return head.split(b"\r\n")[0].decode() + " " + body.decode(errors="replace")
 
 
-def exact(frame: int, channel: str, camera: Camera, scale: float = 10) -> str:
+def exact(frame, channel, camera, scale=10):
     """Return the path of an exact image."""
     fields = json.loads(header_json([camera], 25, {}))["cameras"][0]
     return f"exact/{frame}/{channel}?{urlencode({'camera': json.dumps(fields), 'scale': scale})}"
 
 
-def decoded(content: bytes) -> np.ndarray:
+def decoded(content):
     """Return the RGB image in a file."""
     image = cv2.imdecode(np.frombuffer(content, np.uint8), 1)
     assert image is not None

@@ -2,8 +2,6 @@
 images.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -30,23 +28,23 @@ RENDERING = "!document.getElementById('rendering').hidden"
 class Viewed(Page):
     """A page of the viewer."""
 
-    def __init__(self, browser, url: str, wishes: str = "pause", expected: str | None = None):
+    def __init__(self, browser, url, wishes="pause", expected=None):
         super().__init__(browser, f"{url}#{wishes}")
         if expected is None:
             self.wait(READY)
         else:
             self.page.get_by_text(expected).wait_for()
 
-    def press(self, key: str, condition: str = "true") -> None:
+    def press(self, key, condition="true"):
         self.page.keyboard.press(key)
         self.page.wait_for_timeout(500)  # the view rests
         self.wait(f"player.settled && ({condition})")
 
-    def shows(self, count: str) -> None:
+    def shows(self, count):
         """Wait until the page shows a frame, such as `1 / 3`."""
         self.wait(f"player.settled && document.getElementById('count').textContent === '{count}'")
 
-    def exact_image(self) -> np.ndarray:
+    def exact_image(self):
         """Return the exact image that the page shows, as it was sent."""
         self.page.locator("#rendering").wait_for()
         code = (

@@ -2,8 +2,6 @@
 requests.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -195,7 +193,7 @@ def test_viewer__ends_connections_without_progress_and_beyond_a_limit(clip, monk
     monkeypatch.setattr(access, "MOST", 8)
     with viewing(clip[0]) as url:
 
-        def begun() -> socket.socket:
+        def begun():
             connection = socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=5)
             connection.sendall(b"GET / HT")
             return connection
@@ -319,7 +317,7 @@ def test_viewer__serves_a_provisional_first_frame_until_the_stream_has_one(tmp_p
     write_stream(tmp_path / PROVISIONAL, 1, splats(30, seed=3))
     camera = rig()[0]
 
-    def shown(url: str) -> tuple[str | None, bytes, bytes]:
+    def shown(url):
         response, content = get(url, "stream.morgs")
         return response.headers["Content-Location"], content, get(url, exact(0, "color", camera))[1]
 
@@ -340,7 +338,7 @@ def test_viewer__serves_a_provisional_first_frame_until_the_stream_has_one(tmp_p
 # --------------------------------------------------------------------------------------------------
 
 
-def assert_image(content: bytes, gaussians, camera, channel: str) -> None:
+def assert_image(content, gaussians, camera, channel):
     image = rasterize(gaussians, camera, (channel,))[channel]
     np.testing.assert_array_equal(decoded(content), channel_image(channel, np.array(image), 10))
 
@@ -446,7 +444,7 @@ def live(tmp_path):
     metadata = {"reading": {"gaps": True}, "test_view": None}
     with StreamWriter(tmp_path / "stream.morgs", noise_capture.rig(), 25, metadata) as writer:
 
-        def add(frame: int) -> None:
+        def add(frame):
             write_images(capture, noise_capture.NAMES, [images[frame]] * 3, frame)
             writer.write(keyframe_packet(splat, frame))
 

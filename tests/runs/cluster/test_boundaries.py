@@ -1,7 +1,5 @@
 """Boundaries: the start of a chunk."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -2,31 +2,25 @@
 no trace.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("distributed", reason="comes with the extra `cluster`")
 
-from distributed import Client
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
-from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.chunks import ChunkedRun
 from morgs_mi.runs.cluster.tasks import ChunkConfig
@@ -44,41 +38,41 @@ CHUNKS = ChunkConfig(3, passes=2, epochs=1, overlap=2)
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def capture(tmp_path_factory):
     return load_capture(write_recording(tmp_path_factory.mktemp("capture"), FRAMES))
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
+def client():
     with open_client(count=2) as opened:
         yield opened
 
 
 @pytest.fixture(autouse=True)
-def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_tasks(monkeypatch):
     """Tasks that end within the chunks."""
     monkeypatch.setattr("morgs_mi.runs.cluster.chunks.TASK_FRAMES", 2)
 
 
-def fit(capture: Capture, out: Path, client: Client, **options) -> list[FrameReport]:
+def fit(capture, out, client, **options):
     metadata = {"config": SETTINGS, "chunks": CHUNKS} | options
     resume = metadata.pop("resume", False)
     return ChunkedRun(capture, out, client, **metadata).fit(resume)
 
 
 @pytest.fixture(scope="module")
-def whole(capture: Capture, client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(capture, client, tmp_path_factory):
     """A fit in three chunks, undisturbed, with tasks of another length than the tests'."""
     out = tmp_path_factory.mktemp("whole")
     fit(capture, out, client)
     return out
 
 
-def stream_of(out: Path) -> bytes:
+def stream_of(out):
     return (out / "stream.morgs").read_bytes()
 
 
-def rows_of(out: Path) -> list[dict]:
+def rows_of(out):
     rows = json.loads((out / "report.json").read_text())["frames"]
     return [
         {name: value for name, value in row.items() if name not in ("seconds", "memory")}
@@ -125,18 +119,18 @@ def test_ChunkedRun__reports_frames_and_workers(whole):
     assert all(peak > 1e7 for peak in report["workers"].values())
 
 
-def when_fitted(count: int, action: Callable[[], object]) -> Callable[[str, float, float], None]:
+def when_fitted(count, action):
     """Return a function that acts once, as soon as so many frames are fitted."""
     actions = [action]
 
-    def on_stage(stage: str, done: float, total: float) -> None:
+    def on_stage(stage, done, total):
         if stage == "Fitting frames" and done >= count and actions:
             actions.pop()()
 
     return on_stage
 
 
-def interrupt() -> None:
+def interrupt():
     raise KeyboardInterrupt
 
 
@@ -171,7 +165,7 @@ def test_ChunkedRun__resumes_after_the_beginning_of_a_chunk(
 
 @pytest.mark.slow
 def test_ChunkedRun__with_a_killed_process_is_the_same(capture, client, whole, tmp_path):
-    def kill() -> None:
+    def kill():
         """Kill a worker's process; its nanny starts a new one."""
         os.kill(list(client.run(os.getpid).values())[-1], signal.SIGKILL)
 
@@ -278,7 +272,7 @@ def test_ChunkedRun__has_the_same_balance_of_the_cameras_in_all_chunks(capture, 
 
 
 @pytest.fixture
-def cluster() -> Iterator[subprocess.Popen[str]]:
+def cluster():
     """A process with a scheduler and two workers, which prints the scheduler's address."""
     script = (
         "import sys\n"

@@ -1,7 +1,5 @@
 """The commands of docs/cluster.md run."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -24,7 +22,7 @@ BLOCKS = re.findall(r"<!-- (run|start) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4
 
 
-def started(command: str) -> subprocess.Popen[str]:
+def started(command):
     """Start a command of Dask and wait until it listens."""
     program, *args = shlex.split(command)
     assert program == "dask"
@@ -38,7 +36,7 @@ def started(command: str) -> subprocess.Popen[str]:
 
 
 @pytest.fixture
-def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def workplace(tmp_path, monkeypatch):
     """A folder with a small capture where the demo writes its own."""
     write_recording(tmp_path / "out/demo/capture", FRAMES)
     monkeypatch.chdir(tmp_path)

@@ -1,7 +1,5 @@
 """Tasks that a worker refuses, and results that it stores."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba as mi
@@ -17,7 +15,7 @@ from tests.scenes.recording import CONFIG, write_recording
 
 
 @pytest.fixture(scope="module")
-def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
+def fit(tmp_path_factory):
     capture = load_capture(write_recording(tmp_path_factory.mktemp("clip"), 5))
     return Fit(recording_of(capture), CONFIG, ChunkConfig(), str(mi.variant()), installed())
 

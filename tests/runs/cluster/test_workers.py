@@ -1,7 +1,5 @@
 """Workers: what they run, what happens when they die, and the sentences of what cannot be."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -17,15 +15,15 @@ from morgs_mi.runs.cluster.workers import num_workers, open_client, prepared, wo
 distributed = pytest.importorskip("distributed", reason="comes with the extra `cluster`")
 
 
-def die() -> None:
+def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def fail() -> None:
+def fail():
     raise ValueError("fail(): expected more.")
 
 
-def threads(*tasks) -> tuple[int, str]:
+def threads(*tasks):
     import drjit as dr
 
     with prepared(*tasks):

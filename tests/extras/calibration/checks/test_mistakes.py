@@ -1,29 +1,25 @@
 """The mistakes that the reprojection check names, made one at a time in a rig with true poses."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import match_views
 from morgs_mi.capture.points import MAX_ERROR, SharedFeatures
-from morgs_mi.extras.calibration.checks.rig_check import RigCheck, check_rig
+from morgs_mi.extras.calibration.checks.rig_check import check_rig
 from tests.scenes.textured import turned, with_cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def with_poses(capture: Capture, change: Callable[[np.ndarray], np.ndarray]) -> Capture:
+def with_poses(capture, change):
     """Return the capture with a change of all view matrices."""
     return with_cameras(capture, lambda _, c: replace(c, viewmat=change(c.viewmat)))
 
 
-def fits(check: RigCheck) -> list[bool | None]:
+def fits(check):
     return [camera.fits for camera in check.cameras]
 
 
@@ -39,9 +35,7 @@ def fits(check: RigCheck) -> list[bool | None]:
         ("Nerfstudio", lambda V: FLIP @ np.linalg.inv(FLIP @ V), "world to camera in OpenGL's"),
     ],
 )
-def test_check_rig__names_another_pose_convention(
-    capture, shared, layout, change, sentence
-) -> None:
+def test_check_rig__names_another_pose_convention(capture, shared, layout, change, sentence):
     check = check_rig(replace(with_poses(capture, change), layout=layout), shared)
     assert check.fits is False
     assert check.error > MAX_ERROR
@@ -73,7 +67,7 @@ WRONG_CAMERAS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", WRONG_CAMERAS)
-def test_check_rig__names_a_single_wrong_camera(capture, shared, kind) -> None:
+def test_check_rig__names_a_single_wrong_camera(capture, shared, kind):
     change, sentence = WRONG_CAMERAS[kind]
     check = check_rig(with_cameras(capture, lambda i, c: change(c) if i == 3 else c), shared)
     assert check.advice == "the poses of cam3 do not fit the images."
@@ -84,7 +78,7 @@ def test_check_rig__names_a_single_wrong_camera(capture, shared, kind) -> None:
 
 
 @pytest.mark.slow
-def test_check_rig__names_each_of_two_wrong_cameras(capture, shared) -> None:
+def test_check_rig__names_each_of_two_wrong_cameras(capture, shared):
     changes = {1: WRONG_CAMERAS["upside down"][0], 4: WRONG_CAMERAS["focal"][0]}
     check = check_rig(
         with_cameras(capture, lambda i, c: changes[i](c) if i in changes else c), shared
@@ -94,7 +88,7 @@ def test_check_rig__names_each_of_two_wrong_cameras(capture, shared) -> None:
     assert "its focal length" in check.cameras[4].advice
 
 
-def test_check_rig__names_a_common_factor_on_all_focal_lengths(capture, shared) -> None:
+def test_check_rig__names_a_common_factor_on_all_focal_lengths(capture, shared):
     """Two views hardly determine a common focal length: the errors are below a pixel, but the right
     one has less.
     """
@@ -106,7 +100,7 @@ def test_check_rig__names_a_common_factor_on_all_focal_lengths(capture, shared) 
 
 
 @pytest.mark.slow
-def test_check_rig__names_cameras_with_one_pose(capture, shared) -> None:
+def test_check_rig__names_cameras_with_one_pose(capture, shared):
     pose = capture.cameras[2].viewmat
     one = check_rig(
         with_cameras(capture, lambda i, c: replace(c, viewmat=pose) if i == 3 else c), shared
@@ -118,7 +112,7 @@ def test_check_rig__names_cameras_with_one_pose(capture, shared) -> None:
     assert all("it has the same pose as cam" in camera.advice for camera in every.cameras)
 
 
-def with_images(shared: SharedFeatures, capture: Capture, order: tuple[int, ...]) -> SharedFeatures:
+def with_images(shared, capture, order):
     """Return the features as if camera i had recorded the images of camera order[i]."""
     features = [shared.features[k] for k in order]
     return SharedFeatures(tuple(features), tuple(match_views(features, capture.cameras)))
@@ -136,14 +130,14 @@ def with_images(shared: SharedFeatures, capture: Capture, order: tuple[int, ...]
         ),
     ],
 )
-def test_check_rig__names_images_in_another_order(capture, shared, order, wrong, sentence) -> None:
+def test_check_rig__names_images_in_another_order(capture, shared, order, wrong, sentence):
     check = check_rig(capture, with_images(shared, capture, order))
     assert {i for i, fit in enumerate(fits(check)) if fit is False} == wrong
     assert sentence in check.advice
 
 
 @pytest.mark.parametrize("count", [2, 4])
-def test_check_rig__names_swapped_images_in_a_small_rig(capture, shared, count) -> None:
+def test_check_rig__names_swapped_images_in_a_small_rig(capture, shared, count):
     """One wrong pose out of a few spoils the matches of most cameras."""
     part = replace(capture, cameras=capture.cameras[:count])
     check = check_rig(part, with_images(shared, part, (1, 0, 2, 3)[:count]))
@@ -152,14 +146,14 @@ def test_check_rig__names_swapped_images_in_a_small_rig(capture, shared, count) 
 
 
 @pytest.mark.slow
-def test_check_rig__names_a_copied_clip(capture, shared) -> None:
+def test_check_rig__names_a_copied_clip(capture, shared):
     check = check_rig(capture, with_images(shared, capture, (0, 1, 2, 3, 3, 5)))
     assert fits(check) == [True, True, True, True, False, True]
     assert "its clip is a copy of the clip of cam3" in check.cameras[4].advice
 
 
 @pytest.mark.slow
-def test_check_rig__names_rows_in_alphabetical_order(capture, shared) -> None:
+def test_check_rig__names_rows_in_alphabetical_order(capture, shared):
     """Meet Room's names have no leading zeros: alphabetically cam_10 precedes cam_2, numerically it
     follows.
     """
@@ -174,7 +168,7 @@ def test_check_rig__names_rows_in_alphabetical_order(capture, shared) -> None:
 
 
 @pytest.mark.slow
-def test_check_rig__names_columns_of_another_convention(capture, shared) -> None:
+def test_check_rig__names_columns_of_another_convention(capture, shared):
     wrong = with_cameras(capture, lambda _, c: turned(c, 90))
     check = check_rig(replace(wrong, layout="poses_bounds"), shared)
     assert check.fits is False

@@ -1,17 +1,13 @@
 """The plot of the rig."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.checks.plots import draw_rig, write_rig
@@ -19,7 +15,7 @@ from morgs_mi.testing import assert_close
 from tests.scenes.cameras import circle, look_at_cameras
 
 
-def test_draw_rig__draws_cameras_at_their_positions() -> None:
+def test_draw_rig__draws_cameras_at_their_positions():
     """Cameras on a line lie side by side seen from above; the held-out one is red, and distant
     points are cut off.
     """
@@ -45,7 +41,7 @@ def test_draw_rig__draws_cameras_at_their_positions() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 8])
-def test_draw_rig__draws_any_rig(count: int) -> None:
+def test_draw_rig__draws_any_rig(count):
     cameras = look_at_cameras(circle(2 * np.pi * np.arange(count) / count, z=0), 60, up=(0, 0, 1))
     figure = Figure()
     draw_rig(figure, cameras, (np.zeros((0, 3)), np.zeros((0, 3))))
@@ -54,16 +50,14 @@ def test_draw_rig__draws_any_rig(count: int) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_write_rig__writes_vector_graphics_with_any_names(
-    textured_capture: Capture, tmp_path: Path
-) -> None:
+def test_write_rig__writes_vector_graphics_with_any_names(textured_capture, tmp_path):
     name = "$\\frac$ カメラ"
     cameras = tuple(replace(camera, name=name) for camera in textured_capture.cameras)
     write_rig(tmp_path / "new" / "rig.svg", replace(textured_capture, cameras=cameras))
     assert "<svg" in (tmp_path / "new" / "rig.svg").read_text()
 
 
-def test_check_plot__names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_plot__names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(
         ValueError, match=r"rig.png: a plot needs .* matplotlib; pip install 'morgs-mi\[plots\]'"

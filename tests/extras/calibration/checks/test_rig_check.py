@@ -1,13 +1,11 @@
 """The reprojection check and triangulation on textured planes seen from known cameras."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.features import detect, match_views
 from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
 from morgs_mi.extras.calibration.checks.rig_check import check_rig
@@ -17,7 +15,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @pytest.mark.slow
-def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures) -> None:
+def test_check_rig__accepts_true_poses(capture, shared):
     check = check_rig(capture, shared)
     assert check.fits
     assert check.advice == "the poses fit the images."
@@ -30,9 +28,7 @@ def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures)
     assert [(camera.verdict, camera.advice) for camera in check.cameras] == 6 * [("fits", "")]
 
 
-def test_check_rig__does_not_check_a_camera_without_matches(
-    capture: Capture, shared: SharedFeatures
-) -> None:
+def test_check_rig__does_not_check_a_camera_without_matches(capture, shared):
     others = tuple(match for match in shared.matches if 3 not in match.views)
     check = check_rig(capture, SharedFeatures(shared.features, others))
     assert check.fits is None
@@ -45,9 +41,7 @@ def test_check_rig__does_not_check_a_camera_without_matches(
     )
 
 
-def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(
-    capture: Capture, shared: SharedFeatures
-) -> None:
+def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(capture, shared):
     some = tuple(match for match in shared.matches if 5 not in match.views or match.views == (4, 5))
     wrong = with_cameras(capture, lambda i, c: turned(c, 20) if i == 4 else c)
     check = check_rig(wrong, SharedFeatures(shared.features, some))
@@ -55,7 +49,7 @@ def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(
     assert "matches only with cameras that do not fit" in check.cameras[5].advice
 
 
-def test_check_rig__is_undecided_without_matches(capture: Capture) -> None:
+def test_check_rig__is_undecided_without_matches(capture):
     blank = (detect(np.full((48, 64, 3), 128, np.uint8)),) * 6
     check = check_rig(capture, SharedFeatures(blank, tuple(match_views(blank, capture.cameras))))
     assert (check.fits, check.matches) == (None, 0)
@@ -63,9 +57,7 @@ def test_check_rig__is_undecided_without_matches(capture: Capture) -> None:
     assert "too few matches" in check.advice
 
 
-def test_check_rig__is_undecided_with_fewer_than_fifty_matches(
-    capture: Capture, shared: SharedFeatures
-) -> None:
+def test_check_rig__is_undecided_with_fewer_than_fifty_matches(capture, shared):
     first = shared.matches[0]
     for count, fits in ((49, None), (50, True)):
         few = SharedFeatures(shared.features, (replace(first, features=first.features[:count]),))
@@ -74,9 +66,7 @@ def test_check_rig__is_undecided_with_fewer_than_fifty_matches(
     assert "the poses of 2 of 6 cameras fit the images; not checked: cam2, cam3" in check.advice
 
 
-def test_triangulate_points__ignores_the_held_out_view(
-    capture: Capture, shared: SharedFeatures
-) -> None:
+def test_triangulate_points__ignores_the_held_out_view(capture, shared):
     points = triangulate_points(capture, shared)
     assert len(points.points) == len(points.point_colors) > 1000
     held_out = replace(capture, test_views=(3,))
@@ -92,9 +82,7 @@ def test_triangulate_points__ignores_the_held_out_view(
 
 
 @pytest.mark.slow
-def test_match_capture__finds_features_at_the_recorded_size(
-    capture: Capture, shared: SharedFeatures
-) -> None:
+def test_match_capture__finds_features_at_the_recorded_size(capture, shared):
     small = load_capture(capture.path, 4)
     matches = match_capture(small)
     assert [len(f.points) for f in matches.features] == [len(f.points) for f in shared.features]
@@ -106,9 +94,7 @@ def test_match_capture__finds_features_at_the_recorded_size(
     assert len(points) == pytest.approx(count, rel=0.01)
 
 
-def test_triangulate_points__matches_distant_views_with_their_poses(
-    capture: Capture, shared: SharedFeatures
-) -> None:
+def test_triangulate_points__matches_distant_views_with_their_poses(capture, shared):
     ends = replace(
         capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=()
     )
