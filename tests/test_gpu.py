@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Gaussians, StreamLoop, rasterize
 from morgs_mi.core.memory import from_numpy
@@ -94,7 +95,7 @@ def test_gaussian_splat__survives_switching_variants():
         on(variant, lambda: {"image": mi.render(make_mitsuba_scene(to_gaussians(raw)))})["image"]
         for variant in ("cuda_ad_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
     ]
-    np.testing.assert_array_equal(images[0], images[2])
+    assert_array_equal(images[0], images[2])
     assert_close(images[0], images[1], atol=tol.IMAGE_ABS)
 
 

@@ -72,7 +72,6 @@ def test_cells__show_images_streams_and_progress():
             r'<div>(\w+)(?:: [\w ]+)? <progress value="([\d.]+)" max="([\d.]+)".*',
             shown(bar)["text/html"],
         )
-        assert match is not None
         assert (match[1], float(match[2])) == (title, float(match[3]))
 
 

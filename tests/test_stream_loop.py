@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from morgs_mi import rasterize, stream_loop
 from morgs_mi.codec.container import PacketKind
@@ -103,7 +104,7 @@ def with_fit(config=QUICK, **changes):
 
 def assert_same(gaussians, expected):
     """Assert that two sets of Gaussians are equal to the bit, apart from attributes without one."""
-    np.testing.assert_equal(gaussians.numpy(), expected.numpy())
+    assert_equal(gaussians.numpy(), expected.numpy())
 
 
 @pytest.fixture(scope="module")
@@ -469,7 +470,7 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
     loop.resume(coded, [[*images]])
     images[:] = 0
     history = loop.state.history.images
-    np.testing.assert_array_equal([history[view] for view in range(4)], clip[0][:4])
+    assert_array_equal([history[view] for view in range(4)], clip[0][:4])
     with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
         loop.resume(coded, [[*images[:, :50]]])
 
@@ -553,7 +554,7 @@ def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
     gains, _, _, reports = auto_exposed
     grey = 0.4 * np.ones(3)
     middle = np.array([[np.mean(e(grey)) / 0.4 for e in report.exposures] for report in reports])
-    np.testing.assert_allclose(middle / middle[0], gains / gains[0], atol=0.01)
+    assert_allclose(middle / middle[0], gains / gains[0], atol=0.01)
     assert np.abs(np.log(middle[0])).max() > 0.02, "the cameras differ in the first frame, too"
     assert "The cameras were balanced" in reports[0].validation["exposure"]["sentence"]
 

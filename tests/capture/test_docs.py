@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.capture.capture import load_capture
@@ -21,11 +22,11 @@ def test_captures_page__nerfstudio_example_is_read_as_described(tmp_path):
     write_video(tmp_path / "cam01", [np.zeros((720, 1280, 3), np.uint8)], 30)
     capture = load_capture(tmp_path)
     camera = capture.cameras[0]
-    np.testing.assert_allclose(camera.position, (5, 6, 7))
+    assert_allclose(camera.position, (5, 6, 7))
     right, down, forward = camera.viewmat[:3, :3]
-    np.testing.assert_allclose(forward, (0, 1, 0), atol=1e-12)
-    np.testing.assert_allclose(-down, (0, 0, 1), atol=1e-12)
-    np.testing.assert_allclose(right, (1, 0, 0), atol=1e-12)
+    assert_allclose(forward, (0, 1, 0), atol=1e-12)
+    assert_allclose(-down, (0, 0, 1), atol=1e-12)
+    assert_allclose(right, (1, 0, 0), atol=1e-12)
     assert capture.metadata()["cameras"][0]["distortion"] == [-0.05, 0.01, 0, 0]
-    np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
-    np.testing.assert_array_equal(capture.point_colors, [[0.5, 0.5, 0.5]])
+    assert_array_equal(capture.points, [[1, 2, 3]])
+    assert_array_equal(capture.point_colors, [[0.5, 0.5, 0.5]])

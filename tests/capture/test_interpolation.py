@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.evaluate.metrics import psnr
@@ -47,4 +48,4 @@ def test_image_between__shows_things_where_they_have_moved_to(share):
 @pytest.mark.parametrize("share", [0, 1])
 def test_image_between__is_a_frame_at_either_end(share):
     frames = moving_square(0), moving_square(4)
-    np.testing.assert_allclose(image_between(*frames, share).astype(int), frames[share], atol=1)
+    assert_allclose(image_between(*frames, share).astype(int), frames[share], atol=1)

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.lens import Lens, opencv_lens, undistortion
 from morgs_mi.core.camera import Camera
@@ -122,4 +123,4 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model, radius):
 def test_opencv_lens__keeps_the_order_of_opencv(coefficients, model, distortion):
     lens = opencv_lens(coefficients)
     assert (lens.model, lens.distortion) == (model, distortion)
-    np.testing.assert_array_equal(lens.opencv_coefficients[: len(coefficients)], coefficients)
+    assert_array_equal(lens.opencv_coefficients[: len(coefficients)], coefficients)

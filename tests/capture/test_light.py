@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.interpolation import image_between
@@ -42,11 +43,11 @@ def test_load_capture__reads_sequences_of_exr_files(tmp_path):
     capture = load_capture(recorded(tmp_path))
     for t, frame in enumerate(capture.frames()):
         for camera, image in enumerate(frame.images):
-            np.testing.assert_array_equal(image, light(camera, t))
+            assert_array_equal(image, light(camera, t))
     white = np.percentile([light(camera, 0).max(axis=-1) for camera in range(2)], 99)
     assert capture.display_exposure == pytest.approx(-np.log2(white))
     shown = next(capture.displayed().frames()).images[0]
-    np.testing.assert_array_equal(shown, display_image(light(0, 0), capture.display_exposure))
+    assert_array_equal(shown, display_image(light(0, 0), capture.display_exposure))
     (tmp_path / "capture.json").write_text('{"display_exposure": -2}')
     assert load_capture(tmp_path).display_exposure == -2
 
@@ -56,7 +57,7 @@ def test_load_capture__masks_transparent_pixels_of_exr_files(tmp_path):
     alpha[:, : WIDTH // 2] = 0.9
     capture = load_capture(recorded(tmp_path, alpha))
     for mask in capture.masks:
-        np.testing.assert_array_equal(mask, alpha == 1)
+        assert_array_equal(mask, alpha == 1)
     assert "cam01: 50.0 % of its pixels are transparent and masked out." in capture.notes
 
 
@@ -77,7 +78,7 @@ def test_process__averages_light_when_it_downscales(tmp_path):
     small = capture.cameras[0].resized(WIDTH // 2, HEIGHT // 2)
     blocks = light(0, 0).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
     smaller = replace(capture, cameras=(small, *capture.cameras[1:]))
-    np.testing.assert_allclose(smaller.process(0, light(0, 0)), blocks, rtol=1e-5)
+    assert_allclose(smaller.process(0, light(0, 0)), blocks, rtol=1e-5)
 
 
 def test_process__keeps_light_positive_through_undistortion(tmp_path):
@@ -89,7 +90,7 @@ def test_process__keeps_light_positive_through_undistortion(tmp_path):
 
 def test_image_between__of_equal_images_is_the_image():
     image = light(0, 0)
-    np.testing.assert_allclose(image_between(image, image, 0.5), image, rtol=1e-4, atol=1e-6)
+    assert_allclose(image_between(image, image, 0.5), image, rtol=1e-4, atol=1e-6)
 
 
 def test_partial_frames__leave_out_a_broken_file(tmp_path):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.rig import seen_points
@@ -43,7 +44,7 @@ def test_stereo_points__lie_on_the_surfaces(views, points_and_colors):
 
 @pytest.mark.slow
 def test_stereo_points__are_the_same_every_time(views, points_and_colors):
-    np.testing.assert_array_equal(points_and_colors[0], dense(views)[0])
+    assert_array_equal(points_and_colors[0], dense(views)[0])
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.codec.container import (
     Packet,
@@ -60,7 +61,7 @@ def assert_equal(got, expected):
     )
     for name, array in expected.arrays.items():
         assert got.arrays[name].dtype == array.dtype
-        np.testing.assert_array_equal(got.arrays[name], array)
+        assert_array_equal(got.arrays[name], array)
 
 
 def test_stream_reader__round_trips_header_and_packets(tmp_path):
@@ -69,8 +70,8 @@ def test_stream_reader__round_trips_header_and_packets(tmp_path):
     assert stream.fps == 29.97
     assert stream.metadata == METADATA
     for got, expected in zip(stream.cameras, cameras(), strict=True):
-        np.testing.assert_array_equal(got.K, expected.K)
-        np.testing.assert_array_equal(got.viewmat, expected.viewmat)
+        assert_array_equal(got.K, expected.K)
+        assert_array_equal(got.viewmat, expected.viewmat)
         assert (got.name, got.width, got.height, got.near) == (
             expected.name,
             expected.width,
@@ -105,7 +106,7 @@ def test_decode_packet__restores_arrays_of_any_memory_order():
     }
     got = decode_packet(Packet(PacketKind.RESIDUAL, 0, arrays).encoded).arrays
     for name, expected in arrays.items():
-        np.testing.assert_array_equal(got[name], expected)
+        assert_array_equal(got[name], expected)
         assert not got[name].flags.writeable
 
 

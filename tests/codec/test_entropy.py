@@ -4,6 +4,7 @@ import contextlib
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
 
@@ -31,7 +32,7 @@ def coded(*columns):
 def test_column_reader__inverts_the_writer_in_order():
     reader = ColumnReader(coded(*COLUMNS.values()))
     for name, column in COLUMNS.items():
-        np.testing.assert_array_equal(reader.take(len(column)), column, name)
+        assert_array_equal(reader.take(len(column)), column, name)
 
 
 @pytest.mark.parametrize("scale", [0.3, 40])

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.packets import (
@@ -37,7 +38,7 @@ def test_residual_packet__of_a_static_frame_is_nearly_empty():
     state = decode(None, keyframe_packet(cloud(5000), 0, CAMERAS))
     packet = residual_packet(state, state.gaussians)
     assert len(packet.encoded) < 200
-    np.testing.assert_array_equal(decode(state, packet).grid.values, state.grid.values)
+    assert_array_equal(decode(state, packet).grid.values, state.grid.values)
 
 
 def test_residual_packet__of_a_decoded_state_reproduces_it():

@@ -9,6 +9,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.core.bounded import MAX_JSON, MAX_TOML, array_names, read_array, read_json, read_toml
 from morgs_mi.io.exr import read_exr, write_exr
@@ -206,8 +207,8 @@ def test_read_array__inverts_save(tmp_path, order):
     array = np.asarray(np.arange(6.0).reshape(2, 3), order=order)
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", data=array, scalar=np.int64(3))
-    np.testing.assert_array_equal(read_array(tmp_path / "a.npy"), array)
-    np.testing.assert_array_equal(read_array(tmp_path / "a.npz", "data"), array)
+    assert_array_equal(read_array(tmp_path / "a.npy"), array)
+    assert_array_equal(read_array(tmp_path / "a.npz", "data"), array)
     assert read_array(tmp_path / "a.npz", "scalar") == 3
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.testing import assert_close
@@ -72,8 +73,8 @@ def test_rays_and_unproject__invert_project(camera):
     assert pixels.shape == (4, 5, 2)
     assert_close(camera.unproject(pixels, depths), points, atol=1e-12)
     origin, directions = camera.rays(pixels[0])
-    np.testing.assert_allclose(origin, camera.position)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    assert_allclose(origin, camera.position)
+    assert_allclose(np.linalg.norm(directions, axis=1), 1)
     assert_close(camera.project(origin + 2.5 * directions)[0], pixels[0], atol=1e-9)
 
 
@@ -84,7 +85,7 @@ def test_projection_jacobian__agrees_with_central_differences(camera):
     for k in range(3):
         step = h * np.eye(3)[k]
         difference = (camera.project(points + step)[0] - camera.project(points - step)[0]) / (2 * h)
-        np.testing.assert_allclose(J[:, :, k], difference, rtol=1e-6, atol=1e-6)
+        assert_allclose(J[:, :, k], difference, rtol=1e-6, atol=1e-6)
     behind = camera.unproject(np.zeros((1, 2)), np.array([-1.0]))
     assert not camera.projection_jacobian(behind).any()
 
@@ -99,8 +100,8 @@ def test_camera__copies_its_matrices():
     camera = Camera(intrinsics, viewmat, 32, 16)
     intrinsics[:] = 7
     viewmat[:] = 7
-    np.testing.assert_array_equal(camera.K, K)
-    np.testing.assert_array_equal(camera.viewmat, VIEWMAT)
+    assert_array_equal(camera.K, K)
+    assert_array_equal(camera.viewmat, VIEWMAT)
 
 
 @pytest.mark.parametrize(

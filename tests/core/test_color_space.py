@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.color_space import (
     decode_light,
@@ -22,8 +23,8 @@ LIGHT = np.concatenate([np.linspace(-0.1, 1, 111), np.geomspace(1, 1e20, 41)])
 def test_encode_light__is_srgb_up_to_white_and_logarithmic_above():
     x = np.linspace(0, 1, 4097).astype(np.float32)
     srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0) ** (1 / 2.4) - 0.055)
-    np.testing.assert_array_equal(encode_light(x), srgb)
-    np.testing.assert_allclose(
+    assert_array_equal(encode_light(x), srgb)
+    assert_allclose(
         encode_light(np.array([100.0, 1e20])), [1 + A * np.log(100), 1 + A * np.log(1e20)]
     )
     assert abs(encode_light(np.array(100.0)) - 3.02) < 0.01
@@ -31,13 +32,13 @@ def test_encode_light__is_srgb_up_to_white_and_logarithmic_above():
 
 def test_decode_light__inverts_encode_light():
     # sRGB's two pieces meet to within 1e-8 only, and its decoding is rounded likewise.
-    np.testing.assert_allclose(decode_light(encode_light(LIGHT)), LIGHT, rtol=1e-6, atol=1e-8)
+    assert_allclose(decode_light(encode_light(LIGHT)), LIGHT, rtol=1e-6, atol=1e-8)
 
 
 def test_encode_light__keeps_nan_and_the_sign_of_negative_values():
     for curve, slope in ((encode_light, 12.92), (decode_light, 1 / 12.92)):
         result = curve(np.array([np.nan, -1.0, 0.0]))
-        np.testing.assert_allclose(result, [np.nan, -slope, 0])
+        assert_allclose(result, [np.nan, -slope, 0])
     assert encode_light(np.array(np.inf)) == np.inf
 
 
@@ -50,10 +51,10 @@ def test_encode_traced__agrees_with_numpy_in_value_and_slope(traced, curve):
     dr.enable_grad(values)
     result = traced(values)
     dr.forward(values)
-    np.testing.assert_allclose(result.numpy(), curve(x.astype(float)), rtol=2e-5, atol=1e-7)
+    assert_allclose(result.numpy(), curve(x.astype(float)), rtol=2e-5, atol=1e-7)
     h = 1e-6
     slope = (curve(x.astype(float) + h) - curve(x.astype(float) - h)) / (2 * h)
-    np.testing.assert_allclose(dr.grad(result).numpy(), slope, rtol=2e-5)
+    assert_allclose(dr.grad(result).numpy(), slope, rtol=2e-5)
     white = mi.Float(1)
     dr.enable_grad(white)
     result = traced(white)
@@ -63,18 +64,18 @@ def test_encode_traced__agrees_with_numpy_in_value_and_slope(traced, curve):
 
 def test_encode_traced__returns_the_bytes_of_mitsubas_srgb_up_to_white():
     x = mi.Float(np.linspace(0, 1, 4097).astype(np.float32))
-    np.testing.assert_array_equal(encode_traced(x).numpy(), mi.math.linear_to_srgb(x).numpy())
-    np.testing.assert_array_equal(decode_traced(x).numpy(), mi.math.srgb_to_linear(x).numpy())
+    assert_array_equal(encode_traced(x).numpy(), mi.math.linear_to_srgb(x).numpy())
+    assert_array_equal(decode_traced(x).numpy(), mi.math.srgb_to_linear(x).numpy())
 
 
 def test_unit_values__divides_bytes_alone():
-    np.testing.assert_array_equal(unit_values(np.uint8([[0, 51, 255]])), [[0, 0.2, 1]])
-    np.testing.assert_array_equal(unit_values(np.float32([[0, 0.5, 3]])), [[0, 0.5, 3]])
+    assert_array_equal(unit_values(np.uint8([[0, 51, 255]])), [[0, 0.2, 1]])
+    assert_array_equal(unit_values(np.float32([[0, 0.5, 3]])), [[0, 0.5, 3]])
 
 
 def test_display_image__brightens_by_stops_and_clips():
     light = np.float32([[[0.25, 0.5, 8]]])
-    np.testing.assert_array_equal(display_image(light, 1), [[[188, 255, 255]]])
+    assert_array_equal(display_image(light, 1), [[[188, 255, 255]]])
     grey = np.uint8([[[7, 8, 9]]])
     assert display_image(grey, 3) is grey
 

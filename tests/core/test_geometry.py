@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
@@ -38,7 +39,7 @@ def test_covariances__agree_with_the_reference():
         raw["log_scales"], raw["quats"].astype(float), matrices, strict=True
     ):
         M = reference.rotation(quat) * np.exp(log_scale)
-        np.testing.assert_allclose(covariance, M @ M.T, rtol=1e-6, atol=1e-9)
+        assert_allclose(covariance, M @ M.T, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -60,7 +61,7 @@ def test_rotated__looks_the_same_to_a_rotated_camera(degree):
     a = rasterize(gaussians, camera, channels)
     b = rasterize(rotated(gaussians, R), turned, channels)
     vectors = replace(gaussians, offset=gaussians.motion)
-    np.testing.assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
+    assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
     for name in channels:
         # A rotation rounds every attribute once in float32; nearly equal depths do not swap on
         # these seeds.

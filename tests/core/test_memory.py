@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.core.memory import check_memory, from_numpy, owned_copy, process_memory
@@ -22,7 +23,7 @@ def test_from_numpy__converts_to_the_type_in_aligned_memory(kind):
     values = np.arange(12.0).reshape(3, 4)
     array = np.asarray(from_numpy(kind, values))
     expected = values if dr.is_tensor_v(kind) else values.ravel()
-    np.testing.assert_array_equal(array, expected.astype(array.dtype))
+    assert_array_equal(array, expected.astype(array.dtype))
     assert array.__array_interface__["data"][0] % 64 == 0
 
 

@@ -136,7 +136,6 @@ def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
             residual_packet(state, moved_gaussians, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT)
         )
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").motion_3d
-    assert result is not None
     assert 0 < result.num_gaussians <= 4
     assert result.relative_error < 1e-3
 

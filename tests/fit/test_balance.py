@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
@@ -60,9 +61,7 @@ def test_balance_cameras__finds_the_exposures_and_takes_them():
     balance = balanced(GAINS)
     for exposure, gain in zip(balance.exposures, GAINS, strict=True):
         # A tenth of the largest change of a tone, 0.075, is left.
-        np.testing.assert_allclose(
-            exposure(TONES), np.repeat(exposed(TONES, gain), 3, axis=1), atol=0.007
-        )
+        assert_allclose(exposure(TONES), np.repeat(exposed(TONES, gain), 3, axis=1), atol=0.007)
     assert balance.taken
     assert balance.balanced_psnr > balance.recorded_psnr + 5
     assert "The cameras were balanced" in balance.sentence

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.core.rig import overlaps
 from morgs_mi.fit.forecast import forecast
@@ -73,6 +74,4 @@ def test_overlaps__are_the_shares_of_an_image_that_each_camera_sees():
     away = look_at_cameras([(0, 0, -4)], 40, target=(0, 0, -8))[0]
     # Half the width and half the height.
     expected = [[1, 0.25, 0], [1, 1, 0], [0, 0, 1]]
-    np.testing.assert_allclose(
-        overlaps([wide, narrow, away], np.zeros((1, 3))), expected, atol=0.01
-    )
+    assert_allclose(overlaps([wide, narrow, away], np.zeros((1, 3))), expected, atol=0.01)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
 from morgs_mi.fit.initialise import (
@@ -37,7 +38,7 @@ def test_fill_points__adds_points_at_the_depth_of_the_others_where_views_show_no
     points, views = few_points()
     filled, filled_colors = fill_points(points, views, 1000, np.random.default_rng(1))
     assert filled.shape == filled_colors.shape == (1000, 3)
-    np.testing.assert_array_equal(filled[:40], points[0])
+    assert_array_equal(filled[:40], points[0])
     added = np.isclose(filled_colors, 0.2).all(axis=1)
     assert 300 < added.sum() < 900
     assert np.mean(filled[added, 0] < 0.2) > 0.7
@@ -50,7 +51,7 @@ def test_fill_points__adds_none_where_pixels_are_not_valid():
     views = [grey_view(view.camera, np.zeros(view.image.shape[:2], bool)) for view in views]
     filled, filled_colors = fill_points(points, views, 100, np.random.default_rng(1))
     assert len(filled) == 100
-    np.testing.assert_allclose(filled_colors, 0.8)
+    assert_allclose(filled_colors, 0.8)
 
 
 @pytest.mark.parametrize("count", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
@@ -97,12 +98,12 @@ def parallel_cameras():
 def test_focus_point__does_not_depend_on_the_origin_of_the_world(cameras):
     shift = np.array([3.0, -2.0, 40.0])
     there = [moved(camera, shift) for camera in cameras]
-    np.testing.assert_allclose(focus_point(there), focus_point(cameras) + shift, atol=1e-4)
+    assert_allclose(focus_point(there), focus_point(cameras) + shift, atol=1e-4)
 
 
 def test_focus_point__is_where_converging_cameras_look():
     cameras = look_at_cameras(arc((-0.4, 0, 0.4), 4), 40, target=(0.3, 0.1, 0.2))
-    np.testing.assert_allclose(focus_point(cameras), (0.3, 0.1, 0.2), atol=1e-6)
+    assert_allclose(focus_point(cameras), (0.3, 0.1, 0.2), atol=1e-6)
 
 
 def test_seed_points__are_far_before_parallel_cameras():
@@ -125,7 +126,7 @@ def test_seed_points__lie_on_valid_pixels_in_their_colours():
     views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
     points, colors = seed_points(views, 101, np.random.default_rng(0))
     assert len(points) == len(colors) == 101
-    np.testing.assert_allclose(colors, 0.2)
+    assert_allclose(colors, 0.2)
     shown = np.zeros(101, bool)
     for camera, mask in zip(cameras, masks, strict=True):
         rows_of_points, pixels, _ = seen_points(camera, points)
@@ -138,8 +139,8 @@ def test_seen_points__leaves_out_points_behind_and_beside_the_camera():
     (camera,) = look_at_cameras([(0, 0, -3)], 60)
     mask, pixels, depths = seen_points(camera, np.array([(0, 0, 0), (0, 0, -6), (9, 0, 0)]))
     assert mask.tolist() == [True, False, False]
-    np.testing.assert_allclose(pixels, [(camera.width / 2, camera.height / 2)])
-    np.testing.assert_allclose(depths, [3])
+    assert_allclose(pixels, [(camera.width / 2, camera.height / 2)])
+    assert_allclose(depths, [3])
 
 
 def test_in_light__points_get_the_median_colours_of_hdr_views():
@@ -154,7 +155,7 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
     outside = np.array([[90, 0, 0]])
     points = np.concatenate([cube, outside]), np.full((31, 3), 0.75)
     expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
-    np.testing.assert_allclose(_in_light(points, views)[1], expected)
+    assert_allclose(_in_light(points, views)[1], expected)
     assert (
         _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras])
         is points

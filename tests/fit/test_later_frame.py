@@ -127,5 +127,4 @@ def test_initial_motion__continues_with_constant_velocity():
     start = initial_motion(
         previous_gaussians, active, {}, {}, replace(PLAIN, constant_velocity=True), rng
     )
-    assert start is not None
     assert np.array_equal(start.displacement, np.full((400, 3), 0.1, np.float32))

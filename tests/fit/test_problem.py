@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import RenderConfig
 from morgs_mi.core.rig import scene_extent
@@ -34,7 +35,7 @@ def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fi
         views_of_ball, points, config, RenderConfig(), np.random.default_rng(0)
     )
     assert (len(result.start), result.start.sh_degree) == (50, 2)  # half, as it grows to all
-    np.testing.assert_allclose(result.start.opacities, 0.3, rtol=1e-6)
+    assert_allclose(result.start.opacities, 0.3, rtol=1e-6)
     assert result.points is points[0]
     assert result.extent == scene_extent(views())
     assert [camera.name for camera in result.cameras] == [camera.name for camera in views()]
@@ -73,24 +74,21 @@ def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(width, size)
     assert (camera.width, camera.height) == size == image.shape[1::-1]
     assert mask is None
     assert image.mean() == pytest.approx(127.5, abs=1)
-    np.testing.assert_allclose(camera.K, np.diag([size[0] / 160, size[1] / 120, 1]) @ LARGE.K)
+    assert_allclose(camera.K, np.diag([size[0] / 160, size[1] / 120, 1]) @ LARGE.K)
 
 
 def test_view__reduced_pixels_are_valid_if_all_that_they_cover_are():
     mask = np.ones((120, 160), bool)
     mask[7, 10] = mask[60:63, 80:85] = False
     reduced = large_view(mask).reduced(80).mask
-    assert reduced is not None
-    np.testing.assert_array_equal(reduced, mask.reshape(60, 2, 80, 2).all(axis=(1, 3)))
+    assert_array_equal(reduced, mask.reshape(60, 2, 80, 2).all(axis=(1, 3)))
 
 
 def test_withheld_blocks__divide_the_valid_pixels():
     valid = np.arange(160) < 120 * np.ones((120, 1))
     rest, unseen = withheld_blocks([large_view(), large_view(valid)], 160, np.random.default_rng(0))
     for allowed, a, b in zip((np.ones_like(valid), valid), rest, unseen, strict=True):
-        assert a.mask is not None
-        assert b.mask is not None
-        np.testing.assert_array_equal(a.mask ^ b.mask, allowed)
+        assert_array_equal(a.mask ^ b.mask, allowed)
         assert not (a.mask & b.mask).any()
         assert b.mask.sum() / allowed.sum() == pytest.approx(1 / 8, abs=0.06)
 

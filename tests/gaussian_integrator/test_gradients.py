@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import RenderConfig, rasterize
 from morgs_mi.surfaces import gaussian_splat
@@ -226,7 +227,7 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     plugin = gradients(mi.render(scene, params))
     direct = gradients(rasterize(splats, camera, ("color",), config=RenderConfig()).color)
     for name, by_plugin, by_rasterize in zip(names, plugin, direct, strict=True):
-        np.testing.assert_array_equal(by_plugin, by_rasterize, err_msg=name)
+        assert_array_equal(by_plugin, by_rasterize, err_msg=name)
 
 
 def counting_renders(monkeypatch):
@@ -278,7 +279,7 @@ def test_gaussian_splat__backward_renders_what_has_changed_since(raw):
         dr.backward(loss)
         return np.array(dr.grad(params["gaussians.opacities"]))
 
-    np.testing.assert_array_equal(gradient("after"), gradient("before"))
+    assert_array_equal(gradient("after"), gradient("before"))
     assert np.abs(gradient("after") - gradient("never")).max() > 0.01
 
 

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
 from morgs_mi.testing import assert_close
@@ -87,7 +88,7 @@ def test_gaussian_splat__crop_equals_that_of_the_full_image(raw):
     full = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)))
     crop = {"crop_offset_x": 5, "crop_offset_y": 7, "crop_width": 9, "crop_height": 4}
     image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), crop, aovs=AOVS)))
-    np.testing.assert_array_equal(image, full[7:11, 5:14])
+    assert_array_equal(image, full[7:11, 5:14])
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "diagonal", "smaller", "larger"])

@@ -3,6 +3,7 @@
 import numpy as np
 import OpenEXR
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.io.exr import opaque_light, read_exr, read_light, write_exr
 
@@ -18,7 +19,7 @@ def test_read_exr__inverts_write_exr_exactly_in_float32(tmp_path):
     assert back.keys() == channels.keys()
     for name, channel in channels.items():
         assert back[name].dtype == np.float32
-        np.testing.assert_array_equal(back[name], channel)
+        assert_array_equal(back[name], channel)
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
@@ -58,7 +59,7 @@ def test_read_light__converts_other_primaries(tmp_path):
     OpenEXR.File(header, channels_of((LIGHT @ to_2020.T).astype(np.float32))).write(
         str(tmp_path / "a.exr")
     )
-    np.testing.assert_allclose(read_light(tmp_path / "a.exr"), LIGHT, atol=0.01)
+    assert_allclose(read_light(tmp_path / "a.exr"), LIGHT, atol=0.01)
 
 
 def write(path, channels, **header):
@@ -80,19 +81,19 @@ def test_read_light__returns_the_display_window_and_opaque_light_its_stored_pixe
         y, x = np.mgrid[:4, :5]
         stored = (x >= data[0]) & (x <= data[2]) & (y >= data[1]) & (y <= data[3])
         expected = stored[..., None] * (np.stack([x, y, x + y], axis=-1) + 20)
-        np.testing.assert_array_equal(read_light(path), expected)
-        np.testing.assert_array_equal(opaque_light(path), stored)
+        assert_array_equal(read_light(path), expected)
+        assert_array_equal(opaque_light(path), stored)
 
 
 def test_read_light__reads_grey_or_the_only_layer_with_its_alpha(tmp_path):
     write_exr(tmp_path / "grey.exr", {"Y": LIGHT[..., 0]})
-    np.testing.assert_array_equal(read_light(tmp_path / "grey.exr"), LIGHT[..., [0, 0, 0]])
+    assert_array_equal(read_light(tmp_path / "grey.exr"), LIGHT[..., [0, 0, 0]])
     alpha = np.linspace(0, 1.1, 20, dtype=np.float32).reshape(4, 5)
     for layer in ("", "ViewLayer.Combined."):
         layers = {f"{layer}{name}": channel for name, channel in channels_of(LIGHT).items()}
         path = write(tmp_path / "a.exr", {**layers, f"{layer}A": alpha, "depth.Y": LIGHT[..., 1]})
-        np.testing.assert_array_equal(read_light(path), LIGHT)
-        np.testing.assert_array_equal(opaque_light(path), alpha >= 1)
+        assert_array_equal(read_light(path), LIGHT)
+        assert_array_equal(opaque_light(path), alpha >= 1)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.splats import without_invalid
@@ -47,7 +48,7 @@ def test_without_invalid__names_what_is_invalid_and_leaves_it_out_with_a_warning
     rest = without_invalid("f.ply", gaussians, 0.5)
     expected = splats(N).select(np.setdiff1d(np.arange(N), rows))
     for key, values in expected.numpy().items():
-        np.testing.assert_array_equal(rest.numpy()[key], values)
+        assert_array_equal(rest.numpy()[key], values)
     (record,) = caplog.records
     assert f"{KINDS[name]} of 3, 5" in record.getMessage()
 

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields, unstructured_to_structured
+from numpy.testing import assert_allclose
 from plyfile import PlyData, PlyElement
 
 from morgs_mi import ellipsoids
@@ -42,9 +43,7 @@ def table(gaussians):
 
 def assert_same(a, b, **tolerance):
     for name, value in a.numpy().items():
-        np.testing.assert_allclose(
-            b.numpy()[name], value, err_msg=name, **({"rtol": 0} | tolerance)
-        )
+        assert_allclose(b.numpy()[name], value, err_msg=name, **({"rtol": 0} | tolerance))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

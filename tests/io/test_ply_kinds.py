@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.io.ply import read_ply
@@ -38,7 +39,7 @@ def columns(*names):
 def test_read_ply__draws_discs_with_a_thin_third_axis(tmp_path, caplog):
     gaussians = read_ply(write(tmp_path / "a.ply", without=("scale_2",)))
     expected = random_gaussians(N, degree=1)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         gaussians.numpy()["log_scales"][:, :2], expected.numpy()["log_scales"][:, :2]
     )
     assert np.exp(gaussians.numpy()["log_scales"][:, 2]).max() < 1e-20

@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.io.compressed_ply import write_compressed_ply
@@ -19,7 +20,7 @@ def test_read_splats__reads_a_splat_file(tmp_path):
     (tmp_path / "a.SPLAT").write_bytes(b"".join(RECORD.pack(*record) for record in records))
     gaussians = read_splats(tmp_path / "a.SPLAT")
     raw = gaussians.numpy()
-    np.testing.assert_array_equal(raw["means"], [[1, 2, 3], [0, 0, 0]])
+    assert_array_equal(raw["means"], [[1, 2, 3], [0, 0, 0]])
     assert_close(np.asarray(gaussians.scales)[0], (0.5, 0.25, 1), rtol=1e-6)
     assert_close(0.5 + SH_C0 * raw["sh_coeffs"][0, 0], (1, 0, 0.2), atol=1e-6)
     assert_close(np.asarray(gaussians.opacities), (0.8, 0), atol=2e-6)

@@ -1,11 +1,11 @@
 """The images that a caller may push, and what the loop makes of them."""
 
-import logging
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core import color_space
 from morgs_mi.core.camera import Camera
@@ -35,14 +35,14 @@ def copied(image):
     ids=["float64", "tensor", "bitmap", "rgba"],
 )
 def test_copied_images__linear_light_stays_as_it_is(image):
-    np.testing.assert_array_equal(copied(image() if callable(image) else image), LIGHT)
+    assert_array_equal(copied(image() if callable(image) else image), LIGHT)
 
 
 def test_copied_images__flag_of_a_bitmap_counts():
-    np.testing.assert_array_equal(copied(mi.Bitmap(GREY)), GREY)
+    assert_array_equal(copied(mi.Bitmap(GREY)), GREY)
     linear = mi.Bitmap(GREY)
     linear.set_srgb_gamma(False)
-    np.testing.assert_allclose(copied(linear), GREY / 255, atol=1e-6)
+    assert_allclose(copied(linear), GREY / 255, atol=1e-6)
 
 
 def test_copied_images__owns_its_memory():
@@ -50,14 +50,13 @@ def test_copied_images__owns_its_memory():
         result = copied(image)
         expected = result.copy()
         image[:] = 0
-        np.testing.assert_array_equal(result, expected)
+        assert_array_equal(result, expected)
 
 
 def test_copied_images__warns_once_of_negative_light(caplog):
     color_space._warn_about_negative_light.cache_clear()
-    with caplog.at_level(logging.WARNING):
-        for _ in range(2):
-            assert copied(LIGHT - 1).min() == 0
+    for _ in range(2):
+        assert copied(LIGHT - 1).min() == 0
     assert len(caplog.records) == 1
 
 
@@ -116,9 +115,9 @@ def observed(images, history=None, **kwargs):
 
 def test_observe_frame__keeps_light_for_the_fit_and_shows_8_bits():
     result = observed([LIGHT], display_exposure=-1.0)
-    np.testing.assert_array_equal(result.encoded[0], encode_light(LIGHT))
+    assert_array_equal(result.encoded[0], encode_light(LIGHT))
     assert result.encoded[0].dtype == np.float32
-    np.testing.assert_array_equal(result.history.images[0], display_image(LIGHT, -1))
+    assert_array_equal(result.history.images[0], display_image(LIGHT, -1))
 
 
 def test_observe_frame__first_frame_determines_the_display_exposure():
@@ -132,4 +131,4 @@ def test_observe_frame__first_frame_determines_the_display_exposure():
 def test_observe_frame__bytes_are_compared_and_shown_alike():
     result = observed([GREY])
     assert result.encoded[0] is result.history.images[0]
-    np.testing.assert_array_equal(result.encoded[0], GREY)
+    assert_array_equal(result.encoded[0], GREY)

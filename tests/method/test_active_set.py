@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import RenderConfig, rasterize
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
@@ -197,7 +198,5 @@ def test_merge__has_the_order_of_the_previous_frame_and_births_last():
     fitted = sheet.select([3, 0])  # the first active one died, and another one was born
     merged, source = active.merge(sheet, fitted, np.array([1, -1]))
     assert source.tolist() == [0, 2, 3, 4, -1]
-    np.testing.assert_array_equal(
-        np.asarray(merged.means), np.asarray(sheet.means)[[0, 2, 3, 4, 0]]
-    )
+    assert_array_equal(np.asarray(merged.means), np.asarray(sheet.means)[[0, 2, 3, 4, 0]])
     assert np.asarray(merged.motion)[:, 0].tolist() == [0, 0, 1, 0, 1], "static ones have no motion"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import boxes_around
@@ -31,9 +32,7 @@ def slices(boxes):
 
 
 def test_boxes__area_counts_pixels(boxes):
-    np.testing.assert_array_equal(
-        boxes.area, [np.ones((48, 64))[box].sum() for box in slices(boxes)]
-    )
+    assert_array_equal(boxes.area, [np.ones((48, 64))[box].sum() for box in slices(boxes)])
     assert np.asarray(boxes.area)[7] == 0
 
 
@@ -43,7 +42,7 @@ def test_union__is_the_blocks_that_the_chosen_boxes_touch(boxes):
     for box in np.array(slices(boxes), object)[chosen]:
         expected[tuple(box)] = True
     grid = BlockGrid(64, 48, block_shape(RenderConfig()))
-    np.testing.assert_array_equal(boxes.union(chosen, grid), grid.counts(expected) > 0)
+    assert_array_equal(boxes.union(chosen, grid), grid.counts(expected) > 0)
 
 
 @pytest.mark.parametrize("factor", [1, 2])
@@ -53,6 +52,4 @@ def test_within__counts_pixels_in_the_blocks_of_a_reduced_view(boxes, factor):
     blocks = region.mask.repeat(factor, 0).repeat(factor, 1)
     expected = [blocks[box].sum() for box in slices(boxes)]
     assert 0 < np.mean(expected) < np.asarray(boxes.area).mean()
-    np.testing.assert_allclose(
-        boxes.within(region.block_table, region.grid, factor), expected, atol=0.05
-    )
+    assert_allclose(boxes.within(region.block_table, region.grid, factor), expected, atol=0.05)

@@ -1,6 +1,7 @@
 """Cohesion: an object moves as a whole, and a patch of a large static surface does not."""
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
@@ -83,7 +84,7 @@ def test_share_confidence__solves_its_equation(monkeypatch):
     few = shared(gaussians, moving(0.5), 0.2)
     monkeypatch.setattr("morgs_mi.method.cohesion.ROUNDS", 151)
     many = shared(gaussians, moving(0.5), 0.2)
-    np.testing.assert_allclose(few, many, atol=1e-5)
+    assert_allclose(few, many, atol=1e-5)
     means = np.asarray(gaussians.means)
     i = 650
     near = np.argsort(np.linalg.norm(means - means[i], axis=1))[1:13]
@@ -91,7 +92,7 @@ def test_share_confidence__solves_its_equation(monkeypatch):
     chroma = color / color.sum(axis=1, keepdims=True)
     affinity = 0.2 * 0.9 * np.exp(-np.sum((chroma[near] - chroma[i]) ** 2, axis=1) / (2 * 0.03**2))
     expected = (moving(0.5)[i] + affinity @ many[near]) / (1 + affinity.sum())
-    np.testing.assert_allclose(many[i], expected, atol=1e-4)
+    assert_allclose(many[i], expected, atol=1e-4)
 
 
 def test_share_confidence__counts_all_but_the_chosen_as_still():
@@ -105,7 +106,7 @@ def test_share_confidence__counts_all_but_the_chosen_as_still():
 def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
     one = isotropic(np.zeros((1, 3)), 0.1, 0.9)
     logit = np.array([1.5], np.float32)
-    np.testing.assert_array_equal(shared(one, logit), logit)
+    assert_array_equal(shared(one, logit), logit)
     alone = shared(wall_and_object(0.0, GREY), moving(0.5), 0)
-    np.testing.assert_array_equal(alone, moving(0.5))
+    assert_array_equal(alone, moving(0.5))
     assert not len(shared(one, logit[:0], indices=np.arange(0)))

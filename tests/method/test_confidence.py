@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
@@ -44,7 +45,7 @@ def test_motion_mask__passes_its_config_to_threshold_and_refiner():
         flow = flow_mask(motion, reliable, config)
         expected = MASK_REFINERS.make(method, config)(image, flow)
         mask = motion_mask(image, motion, reliable, method, config)
-        np.testing.assert_array_equal(mask, expected)
+        assert_array_equal(mask, expected)
         assert np.array_equal(mask, observation.mask) == (config is CONFIG)
     with_grabcut = motion_mask(image, motion, reliable, "grabcut", CONFIG)
     assert not (flow_mask(motion, reliable, CONFIG) & ~with_grabcut).any()

@@ -4,6 +4,7 @@ common.
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.method.exposure import (
@@ -27,7 +28,7 @@ def as_bytes(colors):
 
 
 def assert_close(value, expected, atol):
-    np.testing.assert_allclose((value.gain, value.bias), (expected.gain, expected.bias), atol=atol)
+    assert_allclose((value.gain, value.bias), (expected.gain, expected.bias), atol=atol)
 
 
 def test_fit_exposure__finds_gain_and_bias_of_each_channel():
@@ -58,9 +59,7 @@ def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
 def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_have_no_contrast():
     dull = encode_light(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
     exposure = fit_exposure(dull, encode_light(1.1 * decode_light(dull)))
-    np.testing.assert_allclose(
-        exposure(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003
-    )
+    assert_allclose(exposure(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003)
 
 
 def test_fit_exposure__ignores_masked_pixels():
@@ -81,20 +80,18 @@ def test_exposure__corrects_to_the_colours_of_the_scene():
 def test_exposure__composes():
     first = Exposure((1.2, 1, 1), (0.1, 0, 0))
     second = Exposure((0.5, 2, 1), (0, 0, 0.3))
-    np.testing.assert_allclose(second.after(first)(scene()), second(first(scene())))
-    np.testing.assert_allclose(second.after(first).without(first)(scene()), second(scene()))
+    assert_allclose(second.after(first)(scene()), second(first(scene())))
+    assert_allclose(second.after(first).without(first)(scene()), second(scene()))
 
 
 def test_centred__leaves_differences_between_cameras():
     truth = (WARM, Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0)))
     exposures = centred(truth)
     middle = np.full(3, 0.4)
-    np.testing.assert_allclose(np.mean([e(middle) for e in exposures], axis=0), middle, atol=0.01)
+    assert_allclose(np.mean([e(middle) for e in exposures], axis=0), middle, atol=0.01)
     # The map from one camera's image to another's is the same.
     colors = scene()
-    np.testing.assert_allclose(
-        exposures[1].without(exposures[0])(colors), truth[1].without(truth[0])(colors)
-    )
+    assert_allclose(exposures[1].without(exposures[0])(colors), truth[1].without(truth[0])(colors))
 
 
 def test_centred__is_not_moved_by_a_few_dark_cameras():
@@ -141,4 +138,4 @@ def test_corrected__factor_on_the_light_is_removed_also_above_white():
     exposure = Exposure((gain,) * 3, (0.055 * (gain - 1),) * 3)
     corrected = exposure.corrected(encode_light(1.3 * light).astype(np.float32))
     assert corrected.dtype == np.float32
-    np.testing.assert_allclose(corrected, encode_light(light), rtol=1e-5)
+    assert_allclose(corrected, encode_light(light), rtol=1e-5)

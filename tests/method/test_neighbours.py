@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.method.cohesion import NeighbourIndex
 
@@ -13,8 +14,8 @@ def test_nearest__are_the_nearest_others_in_order(count):
     distance = np.linalg.norm(POINTS[:, None].astype(float) - POINTS, axis=2)
     expected = np.argsort(distance, axis=1)[:, 1 : count + 1]
     index = NeighbourIndex(POINTS)
-    np.testing.assert_array_equal(index.nearest(count), expected)
-    np.testing.assert_array_equal(index.nearest(count, np.array([4, 2])), expected[[4, 2]])
+    assert_array_equal(index.nearest(count), expected)
+    assert_array_equal(index.nearest(count, np.array([4, 2])), expected[[4, 2]])
 
 
 def test_nearest__has_none_for_a_single_point():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.active_set import ChangedView, overlap, responsibility
@@ -83,7 +84,7 @@ def test_responsibility__is_one_where_everything_changed_and_zero_where_nothing_
         for changed in (True, False)
     )
     assert (everything > 0).mean() > 0.5
-    np.testing.assert_allclose(everything[everything > 0], 1, atol=1e-5)
+    assert_allclose(everything[everything > 0], 1, atol=1e-5)
     assert not nothing.any()
 
 
@@ -98,4 +99,4 @@ def test_overlap__counts_hidden_gaussians_and_only_views_in_which_they_are(gauss
     views = changed_views(gaussians, changes)
     areas = np.array([np.asarray(changed_view.boxes.area) for changed_view in views])
     expected = np.where(areas[0] > 0, 1 / np.maximum((areas > 0).sum(axis=0), 1), 0)
-    np.testing.assert_allclose(overlap(len(gaussians), views), expected, atol=1e-5)
+    assert_allclose(overlap(len(gaussians), views), expected, atol=1e-5)

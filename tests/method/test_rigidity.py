@@ -22,7 +22,6 @@ BEFORE = make_wide_scene(40)
 
 def neighbours():
     pairs = find_neighbours(to_gaussians(BEFORE), EXTENT, COUNT, REACH)
-    assert pairs is not None
     return pairs
 
 

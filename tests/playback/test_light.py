@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
@@ -51,7 +52,7 @@ def write(stream, path, stops=0.0):
 def test_write_images__exr_files_have_the_light_of_the_curve(stream, tmp_path):
     write(stream, tmp_path / "a.exr")
     light = read_light(tmp_path / "a.exr")
-    np.testing.assert_allclose(light, decode_light(rendered(stream)), rtol=1e-5)
+    assert_allclose(light, decode_light(rendered(stream)), rtol=1e-5)
     assert light.max() > 4
 
 
@@ -69,7 +70,7 @@ def test_write_images__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
     assert stream_exposure(stream) == 0
     write(stream, tmp_path / "a.png", stream_exposure(stream))
     expected = (np.clip(rendered(stream), 0, 1) * 255 + 0.5).astype(np.uint8)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], expected)
+    assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], expected)
 
 
 @pytest.mark.slow
@@ -86,6 +87,6 @@ def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(st
 
     recorded = inserted(stream, 1.0)
     guessed = inserted(plain, 4.0)
-    np.testing.assert_array_equal(inserted(stream, None), recorded)
-    np.testing.assert_array_equal(inserted(plain, None), guessed)
+    assert_array_equal(inserted(stream, None), recorded)
+    assert_array_equal(inserted(plain, None), guessed)
     assert np.abs(recorded - guessed).max() > 0.1

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.fingerprint import fingerprint
@@ -40,10 +41,8 @@ def capture_of(stream):
 def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip):
     small = load_capture(fitted_clip / "capture", downscale=2)
     full, half = (truth_for_camera(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
-    assert full is not None
-    assert half is not None
-    np.testing.assert_array_equal(half.mask, full.mask[1::2, 1::2])
-    np.testing.assert_allclose(half.motion, full.motion[1::2, 1::2] / 2)
+    assert_array_equal(half.mask, full.mask[1::2, 1::2])
+    assert_allclose(half.motion, full.motion[1::2, 1::2] / 2)
     assert truth_for_camera(small, CAMERAS[0], FRAMES) is None
 
 
@@ -153,7 +152,7 @@ def test_channel_image__draws_other_channels_as_grey_values():
     ramp = np.linspace(0, 1, 8, dtype=np.float32)[None, :, None]
     image = channel_image("wetness", ramp)
     assert (image == image[..., :1]).all()
-    np.testing.assert_array_equal(image, channel_image("alpha", ramp))
+    assert_array_equal(image, channel_image("alpha", ramp))
 
 
 @pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera
 from morgs_mi.codec.frame_source import play
@@ -60,7 +61,7 @@ def test_splat_file__has_the_gaussians_of_the_file_in_one_frame(file):
     ):
         arrays = gaussians.numpy()
         for name, values in expected.items():
-            np.testing.assert_array_equal(arrays[name], values)
+            assert_array_equal(arrays[name], values)
     assert stream.frame_numbers() == [0]
     with pytest.raises(ValueError, match=r"scene\.ply: expected a frame of the stream, got 1"):
         stream.seek(1)
@@ -73,7 +74,7 @@ def test_splat_file__is_coded_like_any_keyframe(file, tmp_path):
     assert written.metadata["default_rig"] is True
     assert [camera.name for camera in written.cameras] == [camera.name for camera in stream.cameras]
     packet = keyframe_packet(read_splats(file), 0, stream.cameras)
-    np.testing.assert_array_equal(written.seek(0).digest, decode(None, packet).digest)
+    assert_array_equal(written.seek(0).digest, decode(None, packet).digest)
     assert [written_packet.encoded for written_packet in written] == [packet.encoded]
 
 

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.playback import visualise
 from morgs_mi.testing import assert_close
@@ -51,7 +52,7 @@ def test_label__fits_any_size():
 def test_write_png__is_lossless_and_removes_its_output_after_a_failure(tmp_path):
     image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), dtype=np.uint8)
     visualise.write_png(tmp_path / "new" / "image.png", image)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new/image.png"))[..., ::-1], image)
+    assert_array_equal(cv2.imread(str(tmp_path / "new/image.png"))[..., ::-1], image)
     (tmp_path / "new" / "taken.png").mkdir()
     with pytest.raises(OSError, match=r"cannot write .*taken\.png"):
         visualise.write_png(tmp_path / "new" / "taken.png", image)

@@ -44,13 +44,11 @@ def split(camera, gaussians, mask):
 
 def drawn_pixels(view):
     """Return 1 on the pixels of the view's blocks [H, W], 0 elsewhere."""
-    assert view.region is not None
     return np.asarray(view.region.mask, float)
 
 
 def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaussians, mask):
     view, active = split(camera, gaussians, mask)
-    assert view.region is not None
     assert 0.1 < view.region.mask.mean() < 0.4
     dr.enable_grad(active.means, active.sh_coeffs, gaussians.means, gaussians.sh_coeffs)
     image = view.render(active, CHANNELS)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import rasterize
 from morgs_mi.render.region import Region
@@ -38,9 +39,7 @@ def test_rasterize__draws_cameras_together_as_one_by_one(gaussians, count):
         alone = rasterize(gaussians, camera, CHANNELS, background=(0.2, 0.4, 0.6))
         for name in CHANNELS:
             assert batch[name].shape == (count, *alone[name].shape)
-            np.testing.assert_array_equal(
-                np.array(batch[name])[v], np.array(alone[name]), err_msg=name
-            )
+            assert_array_equal(np.array(batch[name])[v], np.array(alone[name]), err_msg=name)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import erf
 
 from morgs_mi import Gaussians, RenderConfig, rasterize
@@ -89,7 +90,7 @@ def test_depth_limit__at_infinity_changes_no_bit(scene):
     image = rasterize(to_gaussians(raw), camera, CHANNELS, depth_limit=limit)
     expected = rasterize(to_gaussians(raw), camera, CHANNELS)
     for name in CHANNELS:
-        np.testing.assert_array_equal(image[name], expected[name])
+        assert_array_equal(image[name], expected[name])
 
 
 def test_depth_limit__in_front_of_everything_leaves_nothing(scene):
@@ -191,7 +192,7 @@ def test_depth_limit__on_a_region_equals_the_full_image(scene, limit):
 
 def test_reference__distribution_function_is_the_normal_one():
     q = np.linspace(-5, 5, 101)
-    np.testing.assert_allclose(reference.normal_cdf(q), 0.5 * (1 + erf(q / np.sqrt(2))), atol=2e-4)
+    assert_allclose(reference.normal_cdf(q), 0.5 * (1 + erf(q / np.sqrt(2))), atol=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.render import kernel_recording
 
@@ -30,7 +31,7 @@ def test_recorded__bounds_the_number_of_recordings(monkeypatch, capfd):
             sizes = [2 + (pattern >> bit & 1) for bit in range(5)]
             arrays = [mi.Float(np.arange(size, dtype=np.float32)) for size in sizes]
             for array, result in zip(arrays, function(*arrays), strict=True):
-                np.testing.assert_array_equal(np.asarray(result), 3 * np.asarray(array))
+                assert_array_equal(np.asarray(result), 3 * np.asarray(array))
     assert made[0].n_cached_recordings <= 10 < made[0].n_recordings
     assert not capfd.readouterr().err
 

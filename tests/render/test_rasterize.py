@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import Region
@@ -262,7 +263,7 @@ def test_rasterize__copies_features_and_background_before_it_returns(scene):
             [np.asarray(v) for v in (image.color, image.features, dr.grad(gaussians.means))]
         )
     for expected, result in zip(*images, strict=True):
-        np.testing.assert_allclose(expected, result, rtol=1e-5, atol=1e-5)
+        assert_allclose(expected, result, rtol=1e-5, atol=1e-5)
 
 
 def test_rasterize__compiles_its_kernels_once_for_all_cameras_and_sizes():

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import BlockGrid, Region
@@ -226,8 +227,8 @@ def test_BlockGrid__counts_the_pixels_of_its_blocks(size):
     padded = np.zeros((rows * 4, columns * 8), int)
     padded[: size[0], : size[1]] = mask
     expected = padded.reshape(rows, 4, columns, 8).sum(axis=(1, 3))
-    np.testing.assert_array_equal(grid.counts(mask), expected)
-    np.testing.assert_array_equal(
+    assert_array_equal(grid.counts(mask), expected)
+    assert_array_equal(
         Region(grid, expected > 0).mask,
         Region.of(mask, RenderConfig(block_width=8, block_height=4)).mask,
     )

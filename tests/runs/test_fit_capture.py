@@ -75,7 +75,6 @@ def assert_same(out, whole):
 def process(out, *left):
     args = [sys.executable, "-m", "tests.scenes.recording", str(out), *map(str, left)]
     started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2])
-    assert started.stdout is not None
     assert started.stdout.readline() == b"ready\n"
     return started
 

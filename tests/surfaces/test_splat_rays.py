@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
@@ -151,9 +152,9 @@ def test_splat_rays__inactive_rays_meet_nothing():
     traced = SplatRays(cloud())
     color, transmittance = traced.trace(ray, active)
     for value in (transmittance, traced.transmittance(ray, active)):
-        np.testing.assert_array_equal(np.array(value)[4:], 1)
+        assert_array_equal(np.array(value)[4:], 1)
         assert (np.array(value)[:4] < 1).any()
-    np.testing.assert_array_equal(np.array(color)[:, 4:], 0)
+    assert_array_equal(np.array(color)[:, 4:], 0)
 
 
 def test_splat_rays__of_gaussians_that_are_too_faint_or_too_thin_to_draw():

@@ -6,6 +6,7 @@ import tracemalloc
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import find_models, read_colmap, write_colmap
@@ -53,12 +54,12 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path, kind):
         camera = model.cameras[i]
         assert camera.name == f"{expected.name}.png"
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
-        np.testing.assert_allclose(camera.K, expected.K, rtol=1e-12)
+        assert_allclose(camera.K, expected.K, rtol=1e-12)
         assert_close(camera.viewmat, expected.viewmat, atol=1e-12)
         assert model.lenses[i] == lens
     assert model.points.dtype == np.float64
     rows = np.lexsort(model.points.T), np.lexsort(POINTS.T)
-    np.testing.assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)
+    assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)
     assert_close(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
 
 

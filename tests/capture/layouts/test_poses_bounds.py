@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.core.camera import Camera
@@ -24,10 +25,10 @@ def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path):
     write_poses_bounds(path, cameras(), BOUNDS)
     assert np.load(path).shape == (2, 17)
     read, bounds = read_poses_bounds(path, ["cam00", "cam01"])
-    np.testing.assert_array_equal(bounds, BOUNDS)
+    assert_array_equal(bounds, BOUNDS)
     for got, expected in zip(read, cameras(), strict=True):
         assert (got.name, got.width, got.height) == (expected.name, expected.width, expected.height)
-        np.testing.assert_allclose(got.K, expected.K, rtol=1e-12)
+        assert_allclose(got.K, expected.K, rtol=1e-12)
         assert_close(got.viewmat, expected.viewmat, atol=1e-12)
 
 
@@ -47,7 +48,7 @@ def test_read_poses_bounds__columns_are_down_right_back(tmp_path):
     pose = [[0, 1, 0, 5, 48], [0, 0, -1, 6, 64], [-1, 0, 0, 7, 100]]
     np.save(tmp_path / "p.npy", [[*np.ravel(pose).astype(float), 1.0, 2.0]])
     (camera,), _ = read_poses_bounds(tmp_path / "p.npy", ["cam"])
-    np.testing.assert_allclose(camera.position, (5, 6, 7))
+    assert_allclose(camera.position, (5, 6, 7))
     local = camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1]
     assert_close(local[:3], (1, -2, 10), atol=1e-12)
     assert (camera.width, camera.height, camera.K[0, 0]) == (64, 48, 100)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
@@ -74,7 +75,7 @@ def test_calibrate__recovers_a_rig(tmp_path, capsys):
     assert_close(positions, true, atol=5e-3)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
         assert_close(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
-        np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
+        assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
     assert check_rig(capture, match_capture(capture)).fits
     status = main(["calibrate", str(tmp_path)])
     assert status == 1
@@ -129,7 +130,7 @@ def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path):
     capture = load_capture(tmp_path)
     assert capture.recorded_sizes == tuple(sizes)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
-        np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
+        assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
 
 
 @pytest.mark.slow

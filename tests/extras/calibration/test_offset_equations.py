@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import rasterize
 from morgs_mi.extras.calibration.offset_equations import offset_equations
@@ -66,27 +67,25 @@ def equations(
 def test_solution__has_a_mean_of_zero_over_the_training_views():
     held_out = equations(turning_ball(), held_out=[0])
     assert not held_out.matrix[1:, 0].any()
-    np.testing.assert_allclose(held_out.solution(), OFFSETS - OFFSETS[1:].mean(), atol=0.08)
+    assert_allclose(held_out.solution(), OFFSETS - OFFSETS[1:].mean(), atol=0.08)
 
 
 def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places():
     ball = turning_ball()
     away = np.float32((0.02, -0.02, 0.01))
-    np.testing.assert_allclose(
-        equations(ball, away=away).solution(), equations(ball).solution(), atol=0.03
-    )
+    assert_allclose(equations(ball, away=away).solution(), equations(ball).solution(), atol=0.03)
 
 
 def test_solution__is_how_far_each_view_is_ahead_with_what_the_fit_hides():
     system = equations(turning_ball())
-    np.testing.assert_allclose(system.solution(), OFFSETS, atol=0.06)
-    np.testing.assert_allclose(system.solution(share=0.5), 2 * system.solution())
+    assert_allclose(system.solution(), OFFSETS, atol=0.06)
+    assert_allclose(system.solution(share=0.5), 2 * system.solution())
 
 
 def test_sum__is_between_its_timestamps():
     ball = turning_ball()
     both = equations(ball) + equations(ball, 0 * OFFSETS)
-    np.testing.assert_allclose(both.solution(), OFFSETS / 2, atol=0.05)
+    assert_allclose(both.solution(), OFFSETS / 2, atol=0.05)
 
 
 def test_matrix__does_not_change_with_a_common_offset():
@@ -121,13 +120,11 @@ def test_errors__are_those_of_repeated_noise():
         equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)
     ]
     spread = np.std([each.solution() - each.solution()[0] for each in systems], axis=0)[1:]
-    np.testing.assert_allclose(
-        np.mean([each.errors(0) for each in systems], axis=0)[1:], spread, rtol=0.4
-    )
+    assert_allclose(np.mean([each.errors(0) for each in systems], axis=0)[1:], spread, rtol=0.4)
 
 
 def test_solution__leaves_views_where_they_are_without_motion():
     still = replace(opaque_ball(), motion=np.zeros((400, 3), np.float32))
     system = equations(still)
     assert not system.own.any()
-    np.testing.assert_array_equal(system.solution(), 0)
+    assert_array_equal(system.solution(), 0)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.extras.exports.gltf_export import glb, gltf_axes, write_gltf
@@ -94,8 +95,8 @@ def test_glb__conforms_to_the_extension(degree):
     for name, index in primitive["attributes"].items():
         assert document["accessors"][index]["type"] == TYPES.get(name, "VEC3")
     position = document["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_array_equal(position["min"], arrays["POSITION"].min(0))
-    np.testing.assert_array_equal(position["max"], arrays["POSITION"].max(0))
+    assert_array_equal(position["min"], arrays["POSITION"].min(0))
+    assert_array_equal(position["max"], arrays["POSITION"].max(0))
     assert_close(np.linalg.norm(arrays[f"{KHR}:ROTATION"], axis=1), 1, atol=1e-6)
     assert arrays[f"{KHR}:SCALE"].min() >= 0
     # The fallback colour is linear: sRGB's 0.5 is 0.21404 in linear light.
@@ -114,7 +115,7 @@ def test_write_gltf__renders_the_same_image_in_gltf_axes(tmp_path, degree):
     write_gltf(tmp_path / "g.glb", gaussians, gltf_axes(rig()))
     document, binary = read_glb((tmp_path / "g.glb").read_bytes())
     extras = document["nodes"][0]["extras"]
-    np.testing.assert_array_equal(extras["world_from_gltf"], rotation[:3, :3])
+    assert_array_equal(extras["world_from_gltf"], rotation[:3, :3])
     exported = gaussians_of(attributes(document, binary))
     image = rasterize(exported, replace(camera, viewmat=camera.viewmat @ rotation)).color
     # The rotation rounds the float32 attributes once more.

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
@@ -90,7 +91,7 @@ def test_write_usd__attributes_are_read_back(tmp_path, monkeypatch, suffix):
         gaussians = rotated(state.gaussians, gltf_axes(rig()))
         for name, value in expected(gaussians).items():
             assert_close(arrays[name][alive], value, rtol=1e-6, atol=1e-6)
-        np.testing.assert_array_equal(arrays["opacities"][~alive], 0)
+        assert_array_equal(arrays["opacities"][~alive], 0)
         means = gaussians.numpy()["means"]
         reach = 3 * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
         extent = np.array([(means - reach).min(axis=0), (means + reach).max(axis=0)])
@@ -163,7 +164,7 @@ def test_write_usd__begins_a_prim_for_a_new_set_of_gaussians(tmp_path):
         *(f"Gaussians{k}" for k in (1, 2, 3)),
     ]
     visible = [[UsdGeom.Imageable(p).ComputeVisibility(t) for t in FRAMES] for p in prims]
-    np.testing.assert_array_equal(np.array(visible) == "inherited", np.eye(4, dtype=bool))
+    assert_array_equal(np.array(visible) == "inherited", np.eye(4, dtype=bool))
     degrees = [prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() for prim in prims]
     assert degrees == [0, 1, 1, 2]
     assert [len(prim.GetAttribute("positions").Get(0) or ()) for prim in prims] == [5, 7, 0, 3]

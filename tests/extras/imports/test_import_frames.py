@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy.spatial import KDTree
 
 from morgs_mi.cli.main import main
@@ -73,13 +74,13 @@ def test_import_frames__keeps_the_ids_of_the_same_gaussians(clip, tmp_path):
     pixel = 5 / stream.cameras[0].K[0, 0]  # at the distance of the camera
     states = [*coded_frames(stream)]
     for coded in states:
-        np.testing.assert_array_equal(coded.ids, np.arange(N))
+        assert_array_equal(coded.ids, np.arange(N))
         raw = coded.gaussians.numpy()
         expected = moving(coded.frame).numpy()["means"]
         assert_close(raw["means"], expected, atol=0.2 * pixel)
         motion = expected - moving(max(coded.frame - 1, 0)).numpy()["means"]
         assert_close(raw["motion"], motion, atol=0.4 * pixel)
-    np.testing.assert_array_equal(stream.seek(3).gaussians.means, states[3].gaussians.means)
+    assert_array_equal(stream.seek(3).gaussians.means, states[3].gaussians.means)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,7 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
         ids = np.full(N, -1)
         ids[rows[nearest]] = coded.ids
         lasting = (ids >= 0) & (old_ids >= 0)
-        np.testing.assert_array_equal(ids[lasting], old_ids[lasting])
+        assert_array_equal(ids[lasting], old_ids[lasting])
         births = np.setdiff1d(coded.ids, old_ids)
         assert len(births) == len(rows) - lasting.sum()
         old_ids = ids
@@ -148,7 +149,7 @@ COPIES = splats(1).select(np.zeros(50, int))
     ids=["loses and grows", "grows inside", "moves", "one", "copies", "fewer copies"],
 )
 def test_matched_rows__follow_the_order_of_both_frames(old, new, expected):
-    np.testing.assert_array_equal(matched_rows(old, new), expected)
+    assert_array_equal(matched_rows(old, new), expected)
 
 
 @pytest.mark.parametrize(

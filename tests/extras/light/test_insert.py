@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
@@ -49,10 +50,10 @@ def test_render_inserted__shows_the_scene_of_each_frame(stream, tmp_path):
     images = dict(render_inserted(stream, camera(), build, [0, 2], ("color", "alpha")))
     assert list(images) == [0, 2]
     for frame, expected in ((0, (0, 0, 0.735)), (2, (0.735, 0.485, 0.735))):
-        np.testing.assert_allclose(images[frame]["color"][12, 16], expected, atol=2e-3)
+        assert_allclose(images[frame]["color"][12, 16], expected, atol=2e-3)
         assert images[frame]["alpha"][12, 16, 0] == 1
     alone = dict(render_stream(stream, camera(), ("color",)))[0]["color"]
-    np.testing.assert_allclose(images[0]["color"][:4], alone[:4], atol=2e-4)
+    assert_allclose(images[0]["color"][:4], alone[:4], atol=2e-4)
     # The image of a camera with pixels of another height is that of square pixels, resized.
     view = camera().resized(camera().width, 2 * camera().height)
     tall = dict(render_inserted(stream, view, build, [2], ("color", "alpha")))[2]["color"]
@@ -67,7 +68,7 @@ def test_render_inserted__takes_shapes_lights_and_integrator_of_an_xml_file(stre
     build = load_insert(tmp_path / "ball.xml")
     config = InsertConfig(samples=64)
     ((_, images),) = render_inserted(stream, camera(), build, [1], ("color",), config)
-    np.testing.assert_allclose(images["color"][12, 16], (0.735, 0.537, 0), atol=0.05)
+    assert_allclose(images["color"][12, 16], (0.735, 0.537, 0), atol=0.05)
 
 
 @pytest.mark.slow
@@ -112,7 +113,7 @@ def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothi
     outside = images["surfaces"][..., 3] == 0
     assert images["shadow"].min() < 0.7 < images["shadow"].max() == pytest.approx(1)
     light = images["splats"][..., :3] * images["shadow"]
-    np.testing.assert_allclose(decode_light(images["color"])[outside], light[outside], atol=1e-4)
+    assert_allclose(decode_light(images["color"])[outside], light[outside], atol=1e-4)
     write_images([(0, images)], 10, tmp_path / "exr")
     names = read_exr(tmp_path / "exr" / "0000.exr").keys()
     assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X"} <= names

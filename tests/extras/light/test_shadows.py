@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera, Gaussians, rasterize, shadow_ratio, shadowed
 from morgs_mi.core.color_space import decode_light, encode_light
@@ -40,7 +41,7 @@ def scene(**entries):
 def test_shadow_ratio__is_one_where_nothing_is_in_the_way():
     grid = floor(np.random.default_rng(0).uniform(-1, 1, (50, 2)))
     far = {"type": "sphere", "center": [0, -5, 0], "radius": 1.0}
-    np.testing.assert_array_equal(shadow_ratio(grid, scene(sun=SUN, sky=SKY, far=far), EYE, 64), 1)
+    assert_array_equal(shadow_ratio(grid, scene(sun=SUN, sky=SKY, far=far), EYE, 64), 1)
 
 
 def test_shadow_ratio__of_a_directional_light_is_the_projected_outline():
@@ -48,7 +49,7 @@ def test_shadow_ratio__of_a_directional_light_is_the_projected_outline():
     ratios = shadow_ratio(floor(positions), scene(sun=SUN, disk=disk(1.0)), EYE, 4)
     # Light that passes (x, 0, z) was at (x - 0.3, 1, z - 0.2).
     mask = np.hypot(positions[:, 0] - 0.3, positions[:, 1] - 0.2) < 0.5
-    np.testing.assert_array_equal(ratios, ~mask)
+    assert_array_equal(ratios, ~mask)
 
 
 @pytest.mark.parametrize("up", [True, False])

@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
@@ -41,7 +42,7 @@ def assert_as_recorded(rig, frames):
     for live, recorded in zip(frames, rig.frames(), strict=True):
         assert live.index == recorded.index
         for a, b in zip(live.images, recorded.images, strict=True):
-            np.testing.assert_array_equal(a, b)
+            assert_array_equal(a, b)
 
 
 def test_live_frames__process_iterators_and_files_like_clips(rig):

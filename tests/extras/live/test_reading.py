@@ -40,7 +40,6 @@ def test_read_camera__requests_the_size_of_a_camera_of_this_machine(monkeypatch)
     monkeypatch.setattr(cv2, "VideoCapture", lambda source: camera)
     images = read_camera(0, Event(), (640, 480))
     image = next(images)
-    assert image is not None
     assert image[0, 0].tolist() == [3, 2, 1], "RGB"
     assert isinstance(images, Generator)
     images.close()

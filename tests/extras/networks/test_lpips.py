@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.extras.networks.lpips import Lpips
 from morgs_mi.testing import assert_close
@@ -19,7 +20,7 @@ def test_lpips__spatial_network_gives_a_map(tmp_path):
     assert_close(net.distance_map(IMAGE, TRUTH), EXPECTED, atol=1e-6)
     image, truth = ((255 * values).astype(np.uint8) for values in (IMAGE, TRUTH))
     expected = net.distance_map(image / 255, truth / 255)
-    np.testing.assert_allclose(net.distance_map(image, truth), expected)
+    assert_allclose(net.distance_map(image, truth), expected)
 
 
 def test_lpips__other_network_gives_one_number(tmp_path):

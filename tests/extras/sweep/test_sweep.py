@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.config import apply_values, config_toml, read_config
@@ -73,7 +74,7 @@ def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path,
     states.clear()
     again = sweep(*arguments, lambda *state: states.append(state))
     assert states == [("Fitting and evaluating", 8, 8)], "fits that are there have no pace"
-    np.testing.assert_array_equal(again.scores, result.scores)
+    assert_array_equal(again.scores, result.scores)
     assert again.table == result.table
     with pytest.raises(KeyboardInterrupt):
         sweep(*arguments[:4], 3, out, QUICK)

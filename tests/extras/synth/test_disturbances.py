@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera
 from morgs_mi.capture.capture import load_capture
@@ -107,7 +108,7 @@ def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path)
     tracer.set_time((1 + offset) / FPS)
     seed = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
     recorded = list(open_frames(clip / "frames/cam01").frames())[1]
-    np.testing.assert_array_equal(recorded, tracer.render(camera, 4, seed))
+    assert_array_equal(recorded, tracer.render(camera, 4, seed))
     depth = camera.project(tracer.surface_points(camera).positions)[1]
     assert_close(load_truth(clip / "truth", "cam01", 1).depth, depth, atol=1e-5)
     tracks = load_tracks(clip / "truth")
@@ -171,7 +172,7 @@ def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_pat
     similarity = psnr(undistorted_image, expected, mask)
     assert similarity > 28
     assert similarity > psnr(recorded, expected, mask) + 4
-    np.testing.assert_array_equal(
+    assert_array_equal(
         load_truth(clip / "truth", "cam01", 0).ids, tracer.surface_points(camera).ids
     )
     assert_close(capture.cameras[1].K, camera.K, atol=1e-6)

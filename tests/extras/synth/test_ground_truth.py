@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.evaluate.metrics import psnr
@@ -21,7 +22,7 @@ def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_curr
     )
     moves = np.array([item.pose is not None for item in tracer.scene.objects.values()])
     assert (truth.ids >= 0).all()
-    np.testing.assert_array_equal(truth.mask, moves[truth.ids])
+    assert_array_equal(truth.mask, moves[truth.ids])
     assert (truth.motion[~truth.mask] == 0).all()
     grid = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1).astype(np.float32)
 
@@ -75,7 +76,7 @@ def test_load_tracks__visible_points_are_on_the_surfaces_and_move_as_the_motion_
             assert np.median(ahead[in_image & ~visible]) > 0.01
             centred = in_image & (np.abs(pixels % 1 - 0.5).max(axis=1) < 1e-3)
             centred &= np.abs(depth - truth.depth[row, column]) < 1e-4
-            np.testing.assert_array_equal(truth.ids[row, column][centred], tracks.ids[centred])
+            assert_array_equal(truth.ids[row, column][centred], tracks.ids[centred])
             counts += visible.sum(), (in_image & ~visible).sum(), 0
             if frame:
                 motion = pixels - camera.project(tracks.points[:, frame - 1])[0]
@@ -94,4 +95,4 @@ def test_compute_ground_truth__marks_pixels_without_a_surface():
     )
     assert set(np.unique(truth.ids)) == {-1, 0}
     assert (truth.depth[truth.ids < 0] == 0).all()
-    np.testing.assert_array_equal(truth.mask, truth.ids == 0)
+    assert_array_equal(truth.mask, truth.ids == 0)

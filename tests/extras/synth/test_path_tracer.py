@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.extras.synth.ground_truth import compute_ground_truth
 from morgs_mi.extras.synth.path_tracer import PathTracer
@@ -26,7 +27,7 @@ def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
     assert_close(pixels, np.stack([x, y], axis=-1), atol=1e-3)
     poses = tracer.poses(0)
     truth = compute_ground_truth(camera, surface, poses, None, poses)
-    np.testing.assert_allclose(truth.depth, depth, rtol=1e-6)
+    assert_allclose(truth.depth, depth, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +38,7 @@ def test_render__returns_srgb_encoded_images(radiance, expected):
     light = Light({"type": "constant", "radiance": {"type": "rgb", "value": radiance}})
     scene = Scene("sky", {}, {"sky": light})
     image = PathTracer(scene).render(scene.rig.cameras(2, 8, 8)[0], 1, 0)
-    np.testing.assert_array_equal(image, np.uint8(round(expected)))
+    assert_array_equal(image, np.uint8(round(expected)))
 
 
 @pytest.mark.slow
@@ -47,7 +48,7 @@ def test_render__sensor_noise_has_the_requested_standard_deviation(tracer):
     clean, noisy, again = (
         tracer.render(camera, 64, 0, noise).astype(float) for noise in (0.0, 0.02, 0.02)
     )
-    np.testing.assert_array_equal(noisy, again)
+    assert_array_equal(noisy, again)
     noise = (noisy - clean)[(clean > 30) & (clean < 225)]
     # Rounding two images to bytes adds 1/6 to a variance of 26 squared grey levels.
     assert abs(noise.std() / (255 * 0.02) - 1) < 0.03

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap
@@ -38,7 +39,7 @@ def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
     for ours, theirs, colmaps in zip(expected, cameras, model.cameras, strict=True):
         assert_close(theirs.viewmat, ours.viewmat, atol=1e-6)
         assert_close(colmaps.viewmat, ours.viewmat, atol=1e-6)
-        np.testing.assert_allclose(colmaps.K, ours.K)
+        assert_allclose(colmaps.K, ours.K)
         assert colmaps.name == f"{ours.name}.png"
         assert open_frames(clip / f"{ours.name}.mp4").num_frames == 3
         assert len(list((clip / "frames" / ours.name).glob("*.png"))) == 3

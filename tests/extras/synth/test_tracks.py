@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_equal
 
 from morgs_mi import Camera
 from morgs_mi.capture.truth import Tracks, load_tracks, save_tracks
@@ -28,4 +29,4 @@ def test_sees__a_ball_hides_what_is_behind_it(x, expected):
 def test_save_tracks__load_tracks_reads_them_back(tmp_path, visible):
     tracks = Tracks(np.arange(12.0).reshape(2, 2, 3), np.array([1, 2], np.int32), visible)
     save_tracks(tmp_path, tracks)
-    np.testing.assert_equal(vars(load_tracks(tmp_path)), vars(tracks))
+    assert_equal(vars(load_tracks(tmp_path)), vars(tracks))

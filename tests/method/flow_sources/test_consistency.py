@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.method.flow import consistency_mask
 from morgs_mi.method.flow_sources.flow_registry import FlowConfig
@@ -14,14 +15,14 @@ def constant_flow(x, y=0.0):
 def test_consistency_mask__passes_flow_that_returns_inside_the_image():
     mask = consistency_mask(constant_flow(3), constant_flow(-3))
     assert mask.dtype == bool
-    np.testing.assert_array_equal(mask, np.arange(30)[None] + 3 < np.full((20, 1), 30))
+    assert_array_equal(mask, np.arange(30)[None] + 3 < np.full((20, 1), 30))
 
 
 def test_consistency_mask__samples_the_flow_back_where_the_flow_leads():
     back = constant_flow(9)
     back[:, 15:20] = (-5, 0)
     mask = consistency_mask(constant_flow(5), back)
-    np.testing.assert_array_equal(np.flatnonzero(mask.all(axis=0)), np.arange(10, 15))
+    assert_array_equal(np.flatnonzero(mask.all(axis=0)), np.arange(10, 15))
     assert mask.sum() == 5 * 20
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.io.exr import write_exr
 from morgs_mi.method.flow import observe_key_views
@@ -45,7 +46,7 @@ def test_read_flow__reads_files_of_opencv_and_exr_files(tmp_path, name, size):
     flow = random_flow(*size)
     write_flow(tmp_path / name, flow)
     read = read_flow(tmp_path / name)
-    np.testing.assert_array_equal(read, flow)
+    assert_array_equal(read, flow)
     assert read.dtype == np.float32
 
 
@@ -54,7 +55,7 @@ def test_read_flow__accepts_exr_channels_of_other_programs(tmp_path, names):
     flow = random_flow()
     x, y = np.moveaxis(flow, 2, 0)
     write_exr(tmp_path / "a.exr", dict(zip(names, (x, y, 0 * x), strict=False)))
-    np.testing.assert_array_equal(read_flow(tmp_path / "a.exr"), flow)
+    assert_array_equal(read_flow(tmp_path / "a.exr"), flow)
 
 
 def test_flow_source__reads_both_directions_of_a_frame(folder):
@@ -62,8 +63,8 @@ def test_flow_source__reads_both_directions_of_a_frame(folder):
         file.with_name(f"._{file.name}").touch()  # macOS adds these
     for frame in (1, 2):
         back, forward_flow = FLOW_SOURCES.make(f"files:{folder}")(pair_of(frame=frame))
-        np.testing.assert_array_equal(back, random_flow(seed=frame))
-        np.testing.assert_array_equal(forward_flow, random_flow(seed=frame - 1 + 10))
+        assert_array_equal(back, random_flow(seed=frame))
+        assert_array_equal(forward_flow, random_flow(seed=frame - 1 + 10))
 
 
 def test_observe_key_views__negates_and_checks_flow_from_files(tmp_path):
@@ -74,8 +75,8 @@ def test_observe_key_views__negates_and_checks_flow_from_files(tmp_path):
     write_flow(tmp_path / "cam01/forward/6.exr", forward_flow)
     pair = pair_of("cam01", 7, (40, 60))
     observation = observe_key_views({5: pair}, f"files:{tmp_path}")[5]
-    np.testing.assert_array_equal(observation.motion[:, 10:], forward_flow[:, 10:])
-    np.testing.assert_array_equal(observation.forward_flow, forward_flow)
+    assert_array_equal(observation.motion[:, 10:], forward_flow[:, 10:])
+    assert_array_equal(observation.forward_flow, forward_flow)
     assert observation.reliable[3:, 12:].all()
     assert not observation.reliable[:, :10].any()
 

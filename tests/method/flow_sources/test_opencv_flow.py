@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig, FramePair
 from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS, optical_flow
@@ -42,7 +43,7 @@ def test_observe_key_views__uncovered_pixels_are_unreliable():
 def test_optical_flow__float_and_bytes_agree():
     previous, image, _ = moving_disc(64, 96, shift=(2, 1))
     as_bytes = [(frame * 255 + 0.5).astype(np.uint8) for frame in (image, previous)]
-    np.testing.assert_array_equal(optical_flow(image, previous), optical_flow(*as_bytes))
+    assert_array_equal(optical_flow(image, previous), optical_flow(*as_bytes))
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
@@ -76,23 +77,23 @@ def test_flow_config__fine_width_selects_the_finest_level_of_dis():
     fine, half = (
         optical_flow(image, previous, "dis", FlowConfig(fine_width=width)) for width in (96, 95)
     )
-    np.testing.assert_array_equal(fine, optical_flow(image, previous, "dis-fine"))
+    assert_array_equal(fine, optical_flow(image, previous, "dis-fine"))
     gray = (
         cv2.cvtColor((255 * a + 0.5).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         for a in (image, previous)
     )
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # at half resolution
-    np.testing.assert_array_equal(half, method.calc(*gray, None))
+    assert_array_equal(half, method.calc(*gray, None))
     source_flow, _ = FLOW_SOURCES.make("dis", FlowConfig(fine_width=95))(FramePair(image, previous))
-    np.testing.assert_array_equal(source_flow, half)
+    assert_array_equal(source_flow, half)
 
 
 def test_both_directions__computes_flow_inside_the_box_alone():
     previous, image, _ = moving_disc(64, 96, shift=(6, 1))
     box = slice(10, 60), slice(20, 90)
     flow, forward_flow = FLOW_SOURCES.make("dis")(FramePair(image, previous, box=box))
-    np.testing.assert_array_equal(flow[box], optical_flow(image[box], previous[box]))
-    np.testing.assert_array_equal(forward_flow[box], optical_flow(previous[box], image[box]))
+    assert_array_equal(flow[box], optical_flow(image[box], previous[box]))
+    assert_array_equal(forward_flow[box], optical_flow(previous[box], image[box]))
     for each in (flow, forward_flow):
         outside = each.copy()
         outside[box] = 0

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
@@ -39,7 +40,7 @@ def test_mask_refiner__is_repeatable(method):
     _, image, disc = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     refine = MASK_REFINERS.make(method)
     for same in (image, (image * 255 + 0.5).astype(np.uint8)):
-        np.testing.assert_array_equal(refine(same, disc), refine(image, disc))
+        assert_array_equal(refine(same, disc), refine(image, disc))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (700, 20)])

@@ -6,6 +6,7 @@ import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
@@ -43,7 +44,7 @@ def test_export_ply__writes_every_frame(stream, tmp_path):
     ]
     for t, state in enumerate(stream):
         read = read_ply(tmp_path / "ply" / f"{t:04d}.ply")
-        np.testing.assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
+        assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
 
 
 def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
@@ -138,7 +139,7 @@ def test_frames_backwards__are_those_of_the_clip_if_a_keyframe_is_forged(tmp_pat
     frames = _frames_backwards(StreamReader(tmp_path / "s"))
     for frame, gaussians in zip(range(FRAMES - 2, 0, -1), frames, strict=True):
         for name, values in clip.states[frame].gaussians.numpy().items():
-            np.testing.assert_array_equal(gaussians.numpy()[name], values)
+            assert_array_equal(gaussians.numpy()[name], values)
 
 
 def test_render__writes_videos_that_browsers_play(stream, tmp_path):
@@ -226,4 +227,4 @@ def test_exr_channels__names_follow_the_number_of_components():
 def test_pad_to_even__repeats_the_last_row_and_column():
     image = np.arange(45, dtype=np.uint8).reshape(3, 5, 3)
     repeated = image[[0, 1, 2, 2]][:, [0, 1, 2, 3, 4, 4]]
-    np.testing.assert_array_equal(pad_to_even(image), repeated)
+    assert_array_equal(pad_to_even(image), repeated)

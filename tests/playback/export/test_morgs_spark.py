@@ -50,7 +50,6 @@ def example():
     page = re.search(
         r"```html\n(.*?)```", (ROOT / "docs/web-player.md").read_text(encoding="utf-8"), re.DOTALL
     )
-    assert page is not None
     lock = json.loads((ROOT / "web/package-lock.json").read_text(encoding="utf-8"))["packages"]
 
     def local(address):

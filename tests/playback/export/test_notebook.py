@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.playback.export import web
@@ -24,7 +25,6 @@ def test_stream_html__is_the_player_in_a_frame_without_access_to_the_notebook(tm
     text = stream._repr_html_()
     assert 'sandbox="allow-scripts"' in text
     source = re.search(r'srcdoc="([^"]*)"></iframe>$', text, re.DOTALL)
-    assert source is not None
     assert html.unescape(source[1]).encode() == web_page(stream)
 
 
@@ -37,13 +37,10 @@ def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a
     text = stream_html(stream)
     assert f"morgs-mi export web {stream.path} page.html" in text
     source = re.search(r"base64,([^\"]+)", text)
-    assert source is not None
     image = render(states[0].gaussians, stream.cameras[0], ("color",), render_config(stream))[
         "color"
     ]
-    np.testing.assert_array_equal(
-        decoded(base64.b64decode(source[1])), channel_image("color", image)
-    )
+    assert_array_equal(decoded(base64.b64decode(source[1])), channel_image("color", image))
 
 
 @pytest.mark.parametrize("largest", [0, 10**9])
@@ -63,5 +60,5 @@ def test_stream_html__of_a_stream_that_does_not_play_says_why(tmp_path, monkeypa
 def test_image__shows_its_colour():
     image = rasterize(splats(), rig()[0], ("color", "alpha"))
     expected = channel_image("color", np.array(image.color))
-    np.testing.assert_array_equal(decoded(image._repr_png_() or b""), expected)
+    assert_array_equal(decoded(image._repr_png_() or b""), expected)
     assert rasterize(splats(), rig()[0], ("alpha",))._repr_png_() is None

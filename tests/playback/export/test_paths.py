@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import up_direction
@@ -27,7 +28,7 @@ def test_camera_path__interpolates_its_keys_smoothly():
     for time, key in zip(path.times, path.keys, strict=True):
         assert_close(path.at(time).viewmat, key.viewmat, atol=1e-9)
         assert_close(path.at(time).K, key.K, atol=1e-9)
-    np.testing.assert_array_equal(path.at(9).viewmat, path.at(2.5).viewmat)
+    assert_array_equal(path.at(9).viewmat, path.at(2.5).viewmat)
     # No kinks: the steps to both sides of a key differ by the acceleration times their square.
     left, middle, right = (path.at(1 + h).position for h in (-1e-4, 0, 1e-4))
     assert_close(right - middle, middle - left, atol=1e-7)
@@ -37,7 +38,7 @@ def test_through_cameras__visits_the_nearest_next_at_constant_speed():
     cameras = rig()
     path = through_cameras((cameras[0], cameras[2], cameras[1]), 2)
     assert [key.name for key in path.keys] == ["left", "middle", "right"]
-    np.testing.assert_allclose(path.times, [0, 1, 2])
+    assert_allclose(path.times, [0, 1, 2])
 
 
 def test_through_cameras__names_the_path_for_a_single_camera():

@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from starlette.datastructures import Headers
 
 from morgs_mi.capture.layouts.colmap import write_colmap
@@ -340,7 +341,7 @@ def test_viewer__serves_a_provisional_first_frame_until_the_stream_has_one(tmp_p
 
 def assert_image(content, gaussians, camera, channel):
     image = rasterize(gaussians, camera, (channel,))[channel]
-    np.testing.assert_array_equal(decoded(content), channel_image(channel, np.array(image), 10))
+    assert_array_equal(decoded(content), channel_image(channel, np.array(image), 10))
 
 
 @pytest.mark.parametrize("channel", ["color", "motion"])
@@ -455,7 +456,7 @@ def live(tmp_path):
 def test_recorded_images__follow_a_live_fit_in_any_order(live):
     folder, add, images = live
     recorded = RecordedImages(None)
-    np.testing.assert_array_equal(recorded.at(open_stream(folder), 1, 0), images[0])
+    assert_array_equal(recorded.at(open_stream(folder), 1, 0), images[0])
     with pytest.raises(
         ValueError, match="expected a camera and a frame of the stream, got 1 and 1"
     ):
@@ -463,7 +464,7 @@ def test_recorded_images__follow_a_live_fit_in_any_order(live):
     add(1)
     add(2)
     for view, frame in ((1, 2), (1, 2), (0, 0), (0, 1), (2, 1), (0, 2)):
-        np.testing.assert_array_equal(recorded.at(open_stream(folder), view, frame), images[frame])
+        assert_array_equal(recorded.at(open_stream(folder), view, frame), images[frame])
     for file in folder.glob("capture/**/*cam0*/*0001*"):
         file.unlink()
     with pytest.raises(ValueError, match="camera 0 has no image of frame 1"):
@@ -477,7 +478,7 @@ def test_viewer__sends_recorded_images_as_jpeg(live):
         response, content = get(url, "recorded/1/0")
         assert (response.status, response.headers["Content-Type"]) == (200, "image/jpeg")
         expected = decoded(cv2.imencode(".jpg", images[0][..., ::-1])[1].tobytes())
-        np.testing.assert_array_equal(decoded(content), expected)
+        assert_array_equal(decoded(content), expected)
         for path in ("recorded/3/0", "recorded/0/1", "recorded/999999999/999999999"):
             response, content = get(url, path)
             assert response.status == 400
@@ -520,7 +521,6 @@ def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, link, 
     assert main(["view", str(clip[0]), *args]) == 0
     output = " ".join(capsys.readouterr().out.split())
     url = re.search(link, output)
-    assert url is not None
     assert opened == ([] if opens is None else [url[0] + opens])
     note = "Other machines open the same link with the address of this machine in digits."
     assert (note in output) == ("--host" in args)
@@ -543,7 +543,6 @@ def test_view__ends_on_ctrl_c(clip):
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as server:
-        assert server.stdout is not None
         link = next(line for line in server.stdout if "http://" in line)
         assert get(link.split()[0], exact(0, "color", rig()[0]))[0].status == 200
         server.send_signal(signal.SIGINT)

@@ -20,7 +20,6 @@ def test_fit_boundary_frame__leaves_what_is_static_as_it_is():
     for frame in images[:2]:
         loop.push(frame)
     base = loop.state.coded
-    assert base is not None
     config = ChunkConfig(passes=2, epochs=1)
     coded, report = fit_boundary_frame(loop.setup, loop.state, 4, images[4], config)
     assert (coded.frame, report.frame) == (4, 4)

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("distributed", reason="comes with the extra `cluster`")
 
@@ -266,9 +267,7 @@ def test_ChunkedRun__has_the_same_balance_of_the_cameras_in_all_chunks(capture, 
     assert max(max(gain) for gain in balance) > 1.001
     for row in rows[1:]:
         for exposure, first in zip(row["exposures"], balance, strict=True):
-            np.testing.assert_allclose(
-                exposure["gain"], first, atol=0.05, err_msg=f"frame {row['frame']}"
-            )
+            assert_allclose(exposure["gain"], first, atol=0.05, err_msg=f"frame {row['frame']}")
 
 
 @pytest.fixture
@@ -295,7 +294,6 @@ def test_ChunkedRun__names_a_lost_scheduler_and_is_resumed(
     capture, client, whole, cluster, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 2)
-    assert cluster.stdout is not None
     lost = when_fitted(4, cluster.kill)
     with (
         pytest.raises(

@@ -30,7 +30,6 @@ def started(command):
     process = subprocess.Popen(
         [sys.executable, "-m", "dask", *args], stderr=subprocess.PIPE, text=True, env=env
     )
-    assert process.stderr is not None
     next(line for line in process.stderr if "Scheduler at:" in line or "Registered to:" in line)
     return process
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.features import detect, match_views
@@ -75,7 +76,7 @@ def test_triangulate_points__ignores_the_held_out_view(capture, shared):
     features[3] = detect(None)
     others = tuple(match for match in shared.matches if 3 not in match.views)
     blind = SharedFeatures(tuple(features), others)
-    np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
+    assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
     assert len(fewer.points) < len(points.points)
     wrong = with_cameras(capture, lambda _, c: replace(c, viewmat=FLIP @ c.viewmat))
     assert len(triangulate_points(wrong, shared).points) == 0
