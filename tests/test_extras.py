@@ -2,14 +2,13 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import morgs_mi
 from morgs_mi.core.extras import extra, places
+from tests.scenes.programs import run_script
 
 PACKAGE = Path(morgs_mi.__file__).parent
 REGISTRIES = (
@@ -67,14 +66,8 @@ def test_extras__can_all_be_deleted(tmp_path, fitted_clip):
     shutil.copytree(
         PACKAGE, tmp_path / "morgs_mi", ignore=shutil.ignore_patterns("extras", "__pycache__")
     )
-    result = subprocess.run(
-        [sys.executable, "-c", SPINE, fitted_clip / "capture"],
-        cwd=tmp_path,
-        env=environment(tmp_path, PACKAGE.parent),
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    folders = environment(tmp_path, PACKAGE.parent)
+    result = run_script(SPINE, fitted_clip / "capture", cwd=tmp_path, env=folders, timeout=300)
     assert result.returncode == 0, result.stderr
     assert "expected an extra that adds lpips, found none" in result.stderr
 
@@ -94,13 +87,7 @@ def test_extras__of_another_package_register_by_an_entry_point(tmp_path):
     code = (
         "from morgs_mi.method import flow_sources as s; print('zero' in str(vars(s.FLOW_SOURCES)))"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        env=environment(tmp_path, PACKAGE.parent),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    result = run_script(code, env=environment(tmp_path, PACKAGE.parent), timeout=60)
     assert result.stdout == "True\n"
     assert "stranger:missing: this extra is left out" in result.stderr
 

@@ -3,14 +3,13 @@
 import ast
 import inspect
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import morgs_mi
 from tests.scenes.cameras import QUAD, look_at_cameras
+from tests.scenes.programs import run_script
 
 ROOT = Path(__file__).parents[1]
 WITH_EXAMPLE = (
@@ -36,9 +35,7 @@ print(*(set(sys.modules) - before))
 
 
 def test_front_door__is_lazy():
-    names = subprocess.run(
-        [sys.executable, "-c", IMPORT], capture_output=True, text=True, check=True
-    ).stdout.split()
+    names = run_script(IMPORT, check=True).stdout.split()
     own_names = [name for name in names if name.startswith("morgs_mi")]
     assert len([name for name in own_names if not name.startswith("morgs_mi.extras")]) <= 16
     assert all(name.count(".") <= 2 for name in own_names if name.startswith("morgs_mi.extras"))

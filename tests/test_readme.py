@@ -71,15 +71,3 @@ def test_readme__names_commands_that_exist():
 
 def test_readme__is_short():
     assert len(README.splitlines()) <= 120
-
-
-def test_readme__cites_the_paper_as_the_other_pages_do():
-    (authors,) = re.findall(r"author += \{(.*)\}", README)
-    names = [name.split(", ") for name in authors.split(" and ")]
-    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert [family for family, _ in names] == re.findall(r"family-names: (\w+)", citation)
-    assert [first for _, first in names] == re.findall(r"given-names: (\w+)", citation)
-    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
-    for text in (README, page):
-        words = " ".join(text.split())
-        assert all(f"{first} {family}" in words for family, first in names)

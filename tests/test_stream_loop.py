@@ -3,10 +3,8 @@
 import copy
 import dataclasses
 import gc
-import json
 import threading
 from itertools import pairwise
-from pathlib import Path
 from unittest.mock import Mock
 
 import mitsuba as mi
@@ -17,20 +15,17 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from morgs_mi import rasterize, stream_loop
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, decode
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
 from morgs_mi.loop import observation
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import interrupt
 from tests.quick import NO_DENSITY, quick
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic
-from tests.scenes.recording import CONFIG, recording
 from tests.scenes.textured import render, rig, textures
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
@@ -255,12 +250,6 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
 
 
 @pytest.mark.slow
-def test_push__forecasts_nothing_of_a_single_camera(clip):
-    loop = StreamLoop(cameras()[:1], *points_and_colors(), SHORT)
-    assert loop.push(clip[0][:1])[1].validation == {}
-
-
-@pytest.mark.slow
 def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
     ticks = []
     loop = new_loop(with_fit(first_frame_steps=None, first_frame_seconds=1e-3))
@@ -318,26 +307,6 @@ def test_push__without_any_image_nothing_moves(clip):
     packet, report = loop.push(clip[1][:4])
     assert (packet.frame, report.status, report.missing_views) == (2, "ok", ())
     assert "flow" not in report.losses
-
-
-@pytest.mark.slow
-def test_stream_capture__writes_a_file(tmp_path):
-    capture = recording(test_views=(1,), downscale=2, num_frames=2)
-    ticks = []
-    reports = stream_capture(
-        capture, tmp_path / "out", CONFIG, progress=lambda *tick: ticks.append(tick)
-    )
-    path = tmp_path / "out" / "stream.morgs"
-    reader = StreamReader(path)
-    assert [c.name for c in reader.cameras] == [c.name for c in capture.cameras]
-    assert (reader.metadata["train_views"], reader.metadata["downscale"]) == ([0, 2], 2)
-    assert [state.frame for state in reader.states()] == [0, 1]
-    assert sum(r.num_bytes for r in reports) < path.stat().st_size
-    assert ticks[-1] == ("Later frames", 1, 1)
-    names = sorted(p.name for p in path.parent.iterdir())
-    assert names == ["capture.json", "report.json", "stream.morgs"]
-    settings = json.loads((tmp_path / "out" / "capture.json").read_text())
-    assert settings == {"layout": "noise", "capture": str(Path(capture.path).resolve())}
 
 
 def new(cameras_of_loop=None, points=(), colors=(), **more):

@@ -3,8 +3,6 @@
 import os
 import re
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -14,9 +12,6 @@ from morgs_mi.cli.main import main
 from morgs_mi.io.video_writer import write_video
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
-
-Damage = Callable[[Path], object]
-
 
 # ---- damage to clips
 # -------------------------------------------------------------------------------------

@@ -249,16 +249,6 @@ def test_load_capture__masks_what_transparent_pixels_contribute_to(tmp_path, sma
     assert (image[~capture.masks[0]] < 255).any()
 
 
-@pytest.mark.parametrize(
-    "image",
-    [np.full((HEIGHT, WIDTH), 200, np.uint8), np.full((HEIGHT, WIDTH, 3), 200 * 257, np.uint16)],
-    ids=["grey", "16 bits"],
-)
-def test_load_capture__reads_grey_and_16_bit_images(tmp_path, image):
-    capture = load_capture(with_images(tmp_path, [image]))
-    assert (next(capture.frames()).images[0] == 200).all()
-
-
 # ---- photos
 # ----------------------------------------------------------------------------------------------
 

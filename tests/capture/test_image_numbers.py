@@ -6,7 +6,6 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.video_writer import write_video
 from tests.capture.test_timeline import frame_numbers
 from tests.scenes import captures as layouts
@@ -124,8 +123,3 @@ def test_align_numbers__with_trim_are_the_base_of_offsets(tmp_path):
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
     capture = load_capture(path, reading=ReadConfig(trim=True, offset={"b": 1}))
     assert frame_numbers(capture) == [[t, t + 1] for t in range(1, 6)]
-
-
-def test_counting_together__groups_overlapping_numbers():
-    numbers = {"a": [0, 9], "b": [5, 20], "c": [21, 30], "d": [15, 16], "e": [100]}
-    assert counting_together(numbers) == [["a", "b", "d"], ["c"], ["e"]]

@@ -1,8 +1,6 @@
 """The stream file: exact round trips, and detection of every damage."""
 
 import struct
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +16,7 @@ from morgs_mi.codec.container import (
 )
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
+from tests.scenes.programs import run_script
 from tests.scenes.short_clip import sealed
 
 RNG = np.random.default_rng(5)
@@ -289,9 +288,7 @@ with StreamWriter({str(path)!r}, CAMERAS, 30) as stream:
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
     stream.write(Packet(PacketKind.RESIDUAL, 2))
 """
-    result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
+    result = run_script(program, check=True)
     assert f"{path}: 2" in result.stdout
     assert "bytes of complete packets; free space on the disk" in result.stdout
     assert [packet.frame for packet in StreamReader(path)] == [0, 2]

@@ -3,13 +3,13 @@
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from morgs_mi.core.files import atomic_folder, atomic_path, locked_folder, write_json
 from tests.scenes.full_disk import files_end_at
+from tests.scenes.programs import run_script
 
 
 def tree(path):
@@ -183,9 +183,7 @@ def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path):
         "import os, sys; from morgs_mi.core.files import locked_folder\n"
         "with locked_folder(sys.argv[1], 'test()'): os.kill(os.getpid(), 9)\n"
     )
-    assert (
-        subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=False).returncode == -9
-    )
+    assert run_script(script, str(tmp_path)).returncode == -9
     assert len(tree(tmp_path)) == 1
     with locked_folder(tmp_path, "test()"):
         pass

@@ -12,6 +12,7 @@ import weakref
 import pytest
 
 from morgs_mi.core.interrupts import interruptible, interrupts_raised, is_interruption, postponed
+from tests.scenes.programs import run_script
 
 
 def chained(kind, explicit):
@@ -155,9 +156,7 @@ sys.exit(main())
 )
 def test_begin_command__ends_quietly_while_libraries_are_imported(module, number):
     script = STARTING.format(module=module, number=number)
-    result = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
-    )
+    result = run_script(script)
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "Interrupted.\n")
 
 
@@ -177,7 +176,4 @@ def test_begin_command__changes_nothing_in_other_programs():
     script = (
         "import signal; import morgs_mi; print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL)"
     )
-    assert (
-        subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout
-        == b"True\n"
-    )
+    assert run_script(script, check=True).stdout == "True\n"

@@ -1,8 +1,5 @@
 """Copies of NumPy memory for Dr.Jit: types and alignment. Memory that is free."""
 
-import subprocess
-import sys
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,6 +12,7 @@ from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 from tests.quick import quick
 from tests.scenes.changing_splats import rig, splats
+from tests.scenes.programs import run_script
 
 
 @pytest.mark.parametrize("kind", ["Float", "UInt32", "TensorXf"])
@@ -54,9 +52,7 @@ from morgs_mi.core.memory import free_memory
 resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, resource.RLIM_INFINITY))
 print(free_memory())
 """
-    output = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    ).stdout
+    output = run_script(script, check=True).stdout
     assert 0 < float(output.splitlines()[-1]) < 4e9
 
 

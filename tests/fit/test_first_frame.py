@@ -128,12 +128,6 @@ def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
 # ----------------------------------------------------------------------------------------------
 
 
-def test_density_rounds__lie_between_a_tenth_and_a_half():
-    steps = density_rounds(FitConfig(first_frame_steps=1000, density=DensityConfig(rounds=5)))
-    assert steps == [100, 200, 300, 400, 500]
-    assert density_rounds(FitConfig(density=NO_GROWTH)) == []
-
-
 def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_given(images, drawn):
     config = FitConfig(
         sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3)

@@ -15,6 +15,7 @@ from morgs_mi.fit.optimise import (
     view_order,
 )
 from morgs_mi.testing import assert_close
+from tests.scenes.derivatives import backward
 
 
 def bowl(values, view):
@@ -125,7 +126,7 @@ def test_select_rows__keeps_moments_of_survivors_only():
             if rebuild and step == 4:
                 select_rows(optimizer, rows, is_birth)
                 gradients = slope[rows]
-            dr.backward(dr.sum(dr.square(optimizer["x"]) * mi.TensorXf(gradients), axis=None))
+            backward(dr.square(optimizer["x"]) * mi.TensorXf(gradients))
             optimizer.step()
         return np.asarray(values_of(optimizer)["x"])
 

@@ -16,6 +16,7 @@ from tests import tolerances as tol
 from tests.gaussian_integrator.expected import expected_image, to_linear
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import to_gaussians
 from tests.scenes.plugin import AOVS, make_mitsuba_scene
 
@@ -70,7 +71,7 @@ def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
     params = mi.traverse(scene)
     dr.enable_grad([params[name] for name in gradients])
-    dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(weight), axis=None))
+    backward(mi.render(scene, params) * mi.TensorXf(weight))
     for name, expected in gradients.items():
         assert_close(dr.grad(params[name]), expected, rtol=tol.GRADIENT_REL, name=name)
 
@@ -99,7 +100,7 @@ def test_gaussian_splat__backward_agrees_with_central_differences(raw):
     for name in ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"):
         start = np.array(params[name])  # a copy: the parameter is a reference to the scene's array
         dr.enable_grad(params[name])
-        dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+        backward(dr.square(mi.render(scene, params)))
         gradient = np.asarray(dr.grad(params[name]), np.float64)
         direction = np.sign(gradient) * np.random.default_rng(4).uniform(0.5, 1, gradient.shape)
         losses = []
@@ -124,7 +125,7 @@ def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
         [t, 0, 0]
     )
     params.update()
-    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    backward(dr.square(mi.render(scene, params)))
     right = np.zeros((4, 4))
     right[0, 3] = 1
     viewmat = np.float32(make_sensor_camera().viewmat).astype(np.float64)
@@ -159,7 +160,7 @@ def test_gaussian_splat__differentiates_filter_and_crop(raw):
     dr.forward_to(image)
     forward = np.vdot(np.asarray(dr.grad(image), np.float64), g)
     dr.set_grad(data, 0)
-    dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(g), axis=None))
+    backward(mi.render(scene, params) * mi.TensorXf(g))
     assert np.vdot(np.asarray(dr.grad(data), np.float64), v) == pytest.approx(
         forward, rel=tol.DUALITY_REL
     )
@@ -191,7 +192,7 @@ def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     parameter = params[f"sensor.{name}"]
     dr.enable_grad(parameter)
     params.update()
-    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    backward(dr.square(mi.render(scene, params)))
     assert dr.grad(parameter)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
     dr.set_grad(parameter, 1)
     image = mi.render(scene, params)
@@ -212,7 +213,7 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
 
     def gradients(image):
-        dr.backward(dr.sum(image * weight, axis=None))
+        backward(image * weight)
         grads = [np.array(dr.grad(params[name])) for name in names]
         for name in names:
             dr.set_grad(params[name], 0)
@@ -248,7 +249,7 @@ def test_gaussian_splat__backward_uses_the_rendering_of_the_same_parameters(raw,
     opacities = params["gaussians.opacities"]
     dr.enable_grad(opacities)
     calls = counting_renders(monkeypatch)
-    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    backward(dr.square(mi.render(scene, params)))
     assert len(calls) == 1
     derivative = np.array(dr.grad(opacities))
     assert np.abs(derivative).max() > 0
@@ -292,7 +293,7 @@ def test_gaussian_splat__gradient_of_the_background(raw):
     dr.enable_grad(background)
     image = mi.render(scene, params)
     weight = np.float32(np.random.default_rng(7).normal(size=(*image.shape[:2], 3)))
-    dr.backward(dr.sum(image[:, :, :3] * mi.TensorXf(weight), axis=None))
+    backward(image[:, :, :3] * mi.TensorXf(weight))
     transmitted = 1 - rasterize_view(raw, make_sensor_camera())["alpha"]
     assert_close(
         np.array(dr.grad(background)).ravel(),

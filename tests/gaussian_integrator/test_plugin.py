@@ -2,8 +2,6 @@
 
 import gc
 import re
-import subprocess
-import sys
 import textwrap
 from dataclasses import replace
 from pathlib import Path
@@ -21,8 +19,10 @@ from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.gaussian_integrator.expected import to_linear
 from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
 from tests.scenes.plugin import AOVS, make_mitsuba_scene
+from tests.scenes.programs import run_script
 
 
 def test_gaussian_splat__writes_undeveloped_renders(raw, tmp_path):
@@ -85,9 +85,7 @@ for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     except ValueError as error:
         print("\n>", error)
 """
-    output = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    ).stdout
+    output = run_script(script, check=True).stdout
     assert [line for line in output.splitlines() if line.startswith(">")] == [
         "> gaussian_splat: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got "
         "'scalar_rgb'; call mi.set_variant() before the scene is loaded.",
@@ -110,9 +108,7 @@ for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):
     importlib.reload(morgs_mi_plugins)
     print("\n>", mi.load_dict({"type": "gaussian_splat", "aovs": "depth"}).aov_names())
 """
-    lines = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
+    lines = run_script(script, check=True).stdout.splitlines()
     shown = [line for line in lines if line.startswith(">")]
     assert shown == ["> False", "> ['depth.Y']", "> []", "> ['depth.Y']"]
 
@@ -272,11 +268,11 @@ def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
     params = mi.traverse(scene)
     data = params["gaussians.data"]
     dr.enable_grad(data)
-    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    backward(dr.square(mi.render(scene, params)))
     gradient = np.array(dr.grad(data))
     dr.set_grad(data, 0)
     for sensor in single_sensors:
-        dr.backward(dr.sum(dr.square(mi.render(scene, params, sensor=sensor)), axis=None))
+        backward(dr.square(mi.render(scene, params, sensor=sensor)))
     assert_close(gradient, np.array(dr.grad(data)), rtol=1e-5)
 
 
@@ -343,9 +339,7 @@ for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
         except RuntimeError as error:
             print("\n>", "expected a variant such as 'llvm_ad_rgb'" in str(error))
 """
-    output = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    ).stdout
+    output = run_script(script, check=True).stdout
     assert [line for line in output.splitlines() if line.startswith(">")] == 4 * ["> True"]
 
 
@@ -393,7 +387,7 @@ def test_gaussian_splat__renders_a_scene_file_as_the_page_describes(tmp_path, ra
     page = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")
     command = textwrap.dedent(re.findall(r"```bash\n(.*?)```", page, re.DOTALL)[0])
     program = re.search(r'python -c "\n(.*?)"', command, re.DOTALL)[1]
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=tmp_path, timeout=120)
+    run_script(program, check=True, cwd=tmp_path, timeout=120)
     channels = read_exr(tmp_path / "image.exr")
     scene = mi.load_file(str(tmp_path / "scene.xml"))
     expected = np.array(mi.render(scene))

@@ -1,13 +1,12 @@
 """Prefetching in the background: order, bound, errors, and no thread that remains."""
 
-import subprocess
-import sys
 import threading
 import time
 
 import pytest
 
 from morgs_mi.io.prefetch import prefetched
+from tests.scenes.programs import run_script
 
 
 def wait_until(condition):
@@ -106,7 +105,5 @@ def test_prefetched__lets_the_interpreter_end_while_an_item_is_produced():
         "next(frames)\n"
         "raise SystemExit(3)\n"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
-    )
+    result = run_script(script)
     assert (result.returncode, result.stderr) == (3, "")

@@ -3,8 +3,6 @@
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +12,7 @@ from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
 from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.method_registry import Registry
+from tests.scenes.programs import run_script
 
 ROOT = Path(__file__).parents[2]
 
@@ -129,12 +128,5 @@ def test_registry__finds_a_new_module_of_its_package(tmp_path, page, module, pro
     )
     (tmp_path / "morgs_mi/method" / module).write_text(example, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    result = run_script(program, cwd=tmp_path, env=environment)
     assert result.returncode == 0, result.stderr

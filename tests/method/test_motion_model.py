@@ -3,14 +3,13 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.geometry import unit_quats
-from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS, moved, sparse_product
+from morgs_mi.method.motion_model import moved, sparse_product
 from morgs_mi.testing import assert_close
+from tests.scenes.derivatives import backward, gradient
 from tests.scenes.gaussians import make_scene, to_gaussians
 
 RNG = np.random.default_rng(3)
@@ -21,19 +20,11 @@ def tensor(*shape):
     return mi.TensorXf(RNG.normal(size=shape).astype(np.float32))
 
 
-def test_motion_model__is_the_one_that_the_setting_selects():
-    assert MOTION_MODELS.make("none", MotionConfig()) is None
-    with pytest.raises(
-        ValueError, match=r"MotionConfig\(\): `model` must be one of none.*, got 'mesh'\."
-    ):
-        MotionConfig(model="mesh")
-
-
 def test_sparse_product__has_an_adjoint_in_both_modes():
     x = tensor(5, 3)
     weight = tensor(9, 3)
     dr.enable_grad(x)
-    dr.backward(dr.sum(weight * sparse_product(MATRIX, x), axis=None))
+    backward(weight * sparse_product(MATRIX, x))
     assert_close(dr.grad(x), MATRIX.toarray().T @ np.asarray(weight), atol=1e-6)
     x = dr.detach(x)
     dr.enable_grad(x)
@@ -78,7 +69,7 @@ def test_moved__gradients_agree_with_central_differences():
 
     dr.enable_grad(rotation)
     dr.backward(value(rotation))
-    derivative = np.vdot(np.asarray(dr.grad(rotation)), direction)
+    derivative = np.vdot(gradient(rotation), direction)
     at = np.asarray(dr.detach(rotation))
     ends = [
         np.asarray(value(mi.TensorXf(np.asarray(at + h * direction, np.float32)))).item()

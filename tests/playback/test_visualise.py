@@ -41,14 +41,6 @@ def test_depth_image__near_is_red_far_is_blue_undefined_is_grey():
     assert np.unique(visualise.depth_image(np.ones((2, 2, 1)))[..., 0]).size == 1
 
 
-def test_label__fits_any_size():
-    for size in ((1, 1), (20, 30), (480, 640)):
-        image = np.full((*size, 3), 0.5)
-        labelled = visualise.label(image, "frame 12")
-        assert labelled.shape == (*size, 3)
-        assert (labelled != visualise.to_uint8(image)).any()
-
-
 def test_write_png__is_lossless_and_removes_its_output_after_a_failure(tmp_path):
     image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), dtype=np.uint8)
     visualise.write_png(tmp_path / "new" / "image.png", image)

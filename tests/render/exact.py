@@ -13,6 +13,7 @@ import numpy as np
 from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
+from tests.scenes.derivatives import gradient
 from tests.scenes.gaussians import CHANNELS
 
 SIZES = {"color": 3, "motion": 2}
@@ -37,7 +38,7 @@ class Activated:
         return tensor_rows(getattr(self, name), index)
 
     def gradients(self):
-        return {name: np.asarray(dr.grad(getattr(self, name)), np.float64) for name in ATTRIBUTES}
+        return {name: gradient(getattr(self, name)) for name in ATTRIBUTES}
 
 
 def exact_image(values, camera, alpha_min=1 / 255, alpha_max=0.99, viewmat=None):

@@ -12,6 +12,7 @@ from morgs_mi import rasterize
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import make_camera
+from tests.scenes.derivatives import gradient
 from tests.scenes.gaussians import make_scene, to_gaussians
 
 CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
@@ -54,10 +55,9 @@ def test_rasterize__sums_the_gradients_of_cameras():
         posed = [replace(camera, viewmat=pose) for camera, pose in zip(views, poses, strict=True)]
         dr.backward(draw(trained, posed))
         grads = {
-            name: np.array(dr.grad(getattr(trained, name)))
-            for name in ("means", "log_scales", "sh_coeffs")
+            name: gradient(getattr(trained, name)) for name in ("means", "log_scales", "sh_coeffs")
         }
-        return grads | {f"pose {v}": np.array(dr.grad(pose)) for v, pose in enumerate(poses)}
+        return grads | {f"pose {v}": gradient(pose) for v, pose in enumerate(poses)}
 
     batch = gradients(
         lambda trained, posed: dr.sum(

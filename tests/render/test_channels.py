@@ -10,6 +10,7 @@ from morgs_mi import rasterize
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
+from tests.scenes.derivatives import gradient
 from tests.scenes.gaussians import (
     ExtendedGaussians,
     to_gaussians,
@@ -32,7 +33,7 @@ def test_rasterize__renders_a_new_attribute_of_the_table(scene):
         dr.sum(dr.square(image["roughness"]), axis=None)
         + dr.sum(dr.square(image.confidence), axis=None)
     )
-    grad = np.asarray(dr.grad(gaussians.logit_confidence))
+    grad = gradient(gaussians.logit_confidence)
     assert np.abs(grad).max() > 0
     assert_close(dr.grad(gaussians.logit_roughness), grad, rtol=tol.SUM_ORDER_REL)
     with pytest.raises(

@@ -13,6 +13,7 @@ from tests import reference
 from tests import tolerances as tol
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_camera
+from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import (
     CHANNELS,
     RAW,
@@ -34,7 +35,7 @@ def test_rasterize__backward_agrees_with_the_reference_for_every_attribute(scene
 
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, (channel,), background)
-    dr.backward(dr.sum(image[channel] * mi.TensorXf(np.float32(weight)), axis=None))
+    backward(image[channel] * mi.TensorXf(np.float32(weight)))
     expected = reference.complex_step(
         lambda values: np.sum(rasterize_view(values, camera, background)[channel] * weight),
         raw,
@@ -59,7 +60,7 @@ def test_rasterize__antialiased_image_and_gradient_agree_with_the_reference(scen
 
     gaussians = to_gaussians(raw, grad=True)
     color = rasterize(gaussians, camera, ("color",), config=RenderConfig(antialiased=True)).color
-    dr.backward(dr.sum(color * mi.TensorXf(np.float32(weight)), axis=None))
+    backward(color * mi.TensorXf(np.float32(weight)))
     assert_close(color, image_of(raw), atol=tol.IMAGE_ABS)
     assert np.abs(image_of(raw) - rasterize_view(raw, camera)["color"]).max() > 0.1
     names = ["means", "log_scales", "quats", "logit_opacities"]
@@ -126,7 +127,7 @@ def test_rasterize__backward_agrees_with_central_differences(scene):
         )
 
     gaussians = to_gaussians(raw, grad=True)
-    dr.backward(dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None))
+    backward(dr.square(rasterize(gaussians, camera, ("color",)).color))
     rng = np.random.default_rng(4)
     for name in RAW[:5]:
         # The direction is the sign of the gradient: no cancellation hides an error.
@@ -158,7 +159,7 @@ def test_rasterize__detached_weights_give_geometry_no_gradient(scene):
     raw, camera = scene
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, ("color", "motion"), detach_weights=("motion",))
-    dr.backward(dr.sum(image.motion, axis=None))
+    backward(image.motion)
     assert np.abs(np.asarray(dr.grad(gaussians.motion))).max() > 0
     for name in ("log_scales", "quats", "logit_opacities", "sh_coeffs"):
         assert np.abs(np.asarray(dr.grad(getattr(gaussians, name)))).max() == 0, name
@@ -170,12 +171,7 @@ def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
     camera = make_camera(30, 25)
     weight = np.random.default_rng(8).normal(size=(25, 30, 3))
     gaussians = to_gaussians(raw, grad=True)
-    dr.backward(
-        dr.sum(
-            rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)),
-            axis=None,
-        )
-    )
+    backward(rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)))
     names = ["means", "log_scales", "logit_opacities"]
     expected = reference.complex_step(
         lambda v: np.sum(rasterize_view(v, camera)["color"] * weight), raw, names

@@ -2,9 +2,6 @@
 interfere.
 """
 
-import subprocess
-import sys
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,6 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.render import kernel_recording
+from tests.scenes.programs import run_script
 
 
 def scaled(factor, *arrays):
@@ -69,4 +67,4 @@ assert gc.isenabled()
 
 @pytest.mark.slow
 def test_recorded__does_not_deadlock_with_garbage_collection_in_another_thread():
-    subprocess.run([sys.executable, "-c", BUSY], check=True, timeout=120)
+    run_script(BUSY, check=True, timeout=120)

@@ -11,6 +11,7 @@ import numpy as np
 
 from morgs_mi import Camera, Gaussians, ellipsoids
 from tests.scenes.cameras import look_at_cameras
+from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import isotropic
 
 COLOR = (0.6, 0.3, 0.1)
@@ -138,7 +139,7 @@ def slopes_of_both_modes(
             dr.forward_to(image)
             slopes.append(float(np.vdot(np.array(dr.grad(image), np.float64), np.array(weights))))
         else:
-            dr.backward(dr.sum(image * weights, axis=None))
+            backward(image * weights)
             slopes.append(sum(np.array(dr.grad(params[name]), np.float64).sum() for name in names))
     for name in names:
         params[name] = dr.detach(params[name])

@@ -14,11 +14,11 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts import reader_registry
-from morgs_mi.capture.layouts.calibration import Calibration, Reader, required_clips
+from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import clips_by_camera, photos
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.capture.lens import MODELS, Lens
+from morgs_mi.capture.lens import MODELS
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
@@ -191,30 +191,6 @@ def test_load_capture__names_what_reads_a_fit(tmp_path):
         FileNotFoundError, match=r"stream\.morgs: expected a capture folder, found a file"
     ):
         load_capture(tmp_path / "stream.morgs")
-
-
-def test_find_reader__finds_a_layout_that_is_added(tmp_path, monkeypatch):
-    """A new layout costs its `Reader` and an entry in `READERS`."""
-    names = ("cam1", "cam2", "cam10")
-    path = tmp_path / "a"
-
-    def read(path):
-        clips = required_clips(path)
-        return Calibration(tuple(rig(tuple(clips))), (Lens(),) * len(clips), tuple(clips.values()))
-
-    toy = Reader("toy", ("toy.txt",), lambda path: (path / "toy.txt").is_file(), read)
-    monkeypatch.setattr(reader_registry, "READERS", (*reader_registry.READERS, toy))
-    layouts.videos(path, names)
-    with pytest.raises(
-        FileNotFoundError, match=r"sparse/0, sparse, .*, poses_bounds.npy or toy.txt\), found none"
-    ):
-        load_capture(path)
-    (path / "toy.txt").touch()
-    capture = load_capture(path)
-    assert (capture.layout, len(capture.points), capture.test_views) == ("toy", 0, ())
-    assert_holds(capture, names, (0, 1, 2))
-    write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * 3)
-    assert load_capture(path).layout == "poses_bounds"
 
 
 def edit(path, change, name="transforms.json"):

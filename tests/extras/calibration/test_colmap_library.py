@@ -1,10 +1,9 @@
 """The import of pycolmap, whose logging library handles signals."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import morgs_mi
+from tests.scenes.programs import run_script
 
 SCRIPT = """
 import signal, time
@@ -22,9 +21,7 @@ with interruptible():
 
 
 def test_import_pycolmap__keeps_the_handler_of_sigterm():
-    result = subprocess.run(
-        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120
-    )
+    result = run_script(SCRIPT, timeout=120)
     assert (result.returncode, result.stdout, result.stderr) == (0, "interrupted\n", "")
 
 

@@ -88,12 +88,6 @@ def test_sum__is_between_its_timestamps():
     assert_allclose(both.solution(), OFFSETS / 2, atol=0.05)
 
 
-def test_matrix__does_not_change_with_a_common_offset():
-    system = equations(turning_ball(), held_out=[2])
-    common = np.delete(system.matrix, 2, axis=1).sum(axis=1)
-    assert np.abs(np.delete(common, 2) / np.delete(system.own, 2)).max() < 0.01
-
-
 def test_errors__are_large_where_a_change_of_depth_explains_an_offset():
     ball = opaque_ball()
     pair = [(-0.8, 0.0, -4.0), (0.8, 0.0, -4.0)]

@@ -14,7 +14,6 @@ from morgs_mi.extras.calibration.refine import (
     Refinement,
     _joint_step,
     _matched,
-    _moved,
     refine_cameras,
     register_camera,
 )
@@ -139,12 +138,6 @@ def test_register_camera__finds_the_camera_of_an_image(scale):
     camera = register_camera(splats(), View(start, image), 1.0, FitConfig(), RenderConfig())
     error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
-
-
-def test_moved__keeps_the_projections_of_points():
-    points = np.asarray(splats().means)
-    changes = np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0, 0, 0], (4, 1))
-    assert_close(_moved(points, CAMERAS, changes), points + changes[0, 3:6], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(("gain", "accepted"), [(0.05, False), (0.2, True)])

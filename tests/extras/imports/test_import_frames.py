@@ -19,8 +19,6 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.extras.imports.import_frames import (
     find_frames,
     import_frames,
-    matched_rows,
-    same_gaussians,
 )
 from morgs_mi.io.ply import write_ply
 from morgs_mi.testing import assert_close
@@ -123,42 +121,6 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
         births = np.setdiff1d(coded.ids, old_ids)
         assert len(births) == len(rows) - lasting.sum()
         old_ids = ids
-
-
-COPIES = splats(1).select(np.zeros(50, int))
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        (
-            moving(0).select(np.arange(100)),
-            moving(1).select(np.r_[0:40, 45:110]),
-            np.r_[0:40, 45:100, [-1] * 10],
-        ),
-        (
-            moving(0).select(np.arange(100)),
-            moving(1).select(np.r_[0:30, 105:110, 30:100]),
-            np.r_[0:30, [-1] * 5, 30:100],
-        ),
-        (moving(0), moving(3), np.arange(N)),
-        (splats(1), replace(splats(1), means=np.full((1, 3), 5.0)), [0]),
-        (COPIES, COPIES, np.arange(50)),
-        (COPIES, COPIES.select(np.arange(49)), None),
-    ],
-    ids=["loses and grows", "grows inside", "moves", "one", "copies", "fewer copies"],
-)
-def test_matched_rows__follow_the_order_of_both_frames(old, new, expected):
-    assert_array_equal(matched_rows(old, new), expected)
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [np.roll(np.arange(N), 1), np.roll(np.arange(N), -1), np.r_[0:200, 250:300, 200:250]],
-    ids=["shifted back", "shifted on", "partly shifted"],
-)
-def test_same_gaussians__compares_rows(rows):
-    assert not same_gaussians(moving(0), moving(0).select(rows))
 
 
 def test_find_frames__orders_by_number(tmp_path):

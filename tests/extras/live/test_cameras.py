@@ -2,8 +2,6 @@
 faults do.
 """
 
-import subprocess
-import sys
 import time
 from queue import SimpleQueue
 from threading import Timer
@@ -11,7 +9,8 @@ from threading import Timer
 import numpy as np
 import pytest
 
-from morgs_mi.extras.live.cameras import CameraFeed, Shot, _nearest, _simultaneous
+from morgs_mi.extras.live.cameras import CameraFeed
+from tests.scenes.programs import run_script
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 
@@ -62,17 +61,6 @@ def wait_for(feed, *counts):
     for camera, count in zip(feed._cameras, counts, strict=True):
         while not camera.shots or camera.shots[-1].number < count - 1:
             time.sleep(0.001)
-
-
-def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_it():
-    fast = [Shot(IMAGE, time, 0) for time in (0.0, 0.033, 0.066)]
-    slow = [Shot(IMAGE, time, 0) for time in (0.01, 0.04)]
-    stopped = [Shot(IMAGE, -9.0, 0)]
-    assert _nearest([fast, slow], [True, True]) == [fast[1], slow[1]]
-    assert _nearest([fast, []], [True, True]) is None
-    assert _nearest([fast, []], [True, False]) == [fast[2], None]
-    assert _nearest([fast, stopped], [True, True]) is None, "not of one time"
-    assert _simultaneous([fast, slow, [], stopped]) == [True, True, False, False]
 
 
 def test_CameraFeed__skips_what_arrived_during_a_fit(opened):
@@ -186,7 +174,5 @@ def images():
 closed = Event()
 CameraFeed({"cam0": images()}, 5, closed=closed).newest()
 """
-    result = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
+    result = run_script(script, check=True)
     assert result.stdout == "closed\n"

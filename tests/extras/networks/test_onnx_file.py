@@ -10,8 +10,7 @@ import onnx
 import pytest
 from onnx.external_data_helper import set_external_data
 
-from morgs_mi.extras.networks.onnx_file import OnnxNetwork, imagenet_blob
-from morgs_mi.testing import assert_close
+from morgs_mi.extras.networks.onnx_file import OnnxNetwork
 from tests.scenes.tiny_network import export, write
 
 VALUES = 1024
@@ -119,12 +118,3 @@ def test_onnx_network__refuses_results_that_are_not_numbers(tmp_path):
         ValueError, match=r"a\.onnx, output text: expected numbers, got object \[1, 2\]"
     ):
         OnnxNetwork(write(tmp_path / "a.onnx", graph)).run({"image": np.zeros((1, 2), np.float32)})
-
-
-def test_imagenet_blob__is_normalised_and_channels_come_first():
-    image = np.full((20, 30, 3), (255, 0, 51), np.uint8)
-    blob = imagenet_blob(image, 28, 14)
-    assert blob.shape == (1, 3, 14, 28)
-    expected = (np.array([1, 0, 0.2]) - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
-    assert_close(blob[0, :, 3, 4], expected, atol=1e-5)
-    assert_close(imagenet_blob(image / 255, 28, 14), blob, atol=1e-5)

@@ -80,19 +80,6 @@ def test_prompts__points_lie_deep_and_apart_inside_the_box():
     assert cv2.erode(np.uint8(component), np.ones((7, 7)))[rows, columns].all()
 
 
-@pytest.mark.parametrize(
-    ("size", "options", "least_distance"),
-    [((1, 1), {}, 0), ((7, 1), {}, 1), ((10, 100), {"count": 9, "spacing": 0.4}, 40)],
-)
-def test_prompts__of_a_rectangle(size, options, least_distance):
-    coordinates, labels = prompts(np.ones(size, bool), **options)
-    assert coordinates[:2].tolist() == [[0, 0], [*size[::-1]]]
-    assert len(coordinates) == len(labels)
-    assert 3 <= len(labels) <= 5
-    assert (pdist(coordinates[2:]) >= least_distance).all()
-    assert len(prompts(np.ones(size, bool), count=1)[0]) == 2 + 1
-
-
 def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
     image, (disc,) = discs(240, 320, (160, 120), radius=40)
     motion = np.zeros((240, 320, 2))

@@ -15,7 +15,6 @@ from morgs_mi.core.config import apply_values, config_toml, read_config
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import ViewScores
 from morgs_mi.extras.sweep import sweep as module
-from morgs_mi.extras.sweep.plot import draw_curves
 from morgs_mi.extras.sweep.sweep import PARTS, TITLES, SweepResult, leave_out, sweep
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.loop.stream_config import StreamConfig
@@ -168,23 +167,6 @@ def test_sweep__is_a_table_and_a_plot_in_a_notebook():
     text = SweepResult("clip", True, ["default"] * 2, [1, 2], scores, curves, table)._repr_html_()
     assert "<td>arm<td>kB<tr><td>&lt;default&gt;<td>5</table>" in text
     assert "data:image/png;base64,iVBOR" in text
-
-
-@pytest.mark.parametrize("seeds", [1, 3])
-def test_draw_curves__has_wide_axes_and_names(seeds):
-    figure = pytest.importorskip("matplotlib.figure", reason="comes with the extra `plots`")
-    axes = figure.Figure().subplots()
-    rng = np.random.default_rng(seeds)
-    x, y = rng.uniform([[[1]], [[30]]], [[[1.1]], [[30.3]]], (2, 4, seeds))
-    draw_curves(axes, "PSNR, dB", {"baseline": (x, y, [1, 2, 4, 8])})
-    left, right = axes.get_xlim()
-    low, high = axes.get_ylim()
-    assert axes.get_xscale() == "log"
-    assert right / left >= 5.99
-    assert high - low >= 3
-    assert left < x.min() < x.max() < right
-    assert low < y.min() < y.max() < high
-    assert {"baseline", "1", "8"} <= {text.get_text() for text in axes.texts}
 
 
 @pytest.mark.parametrize(

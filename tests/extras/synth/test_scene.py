@@ -27,15 +27,6 @@ def test_load_scene__accepts_dataclasses_with_postponed_annotations(tmp_path):
     assert load_scene(tmp_path / "own.py").name == "own1"
 
 
-@pytest.mark.parametrize(("name", "radius"), [("roller", 0.38), ("circler", 0.28)])
-def test_spheres__balls_roll_without_slipping(name, radius):
-    pose = load_scene("spheres").objects[name].pose
-    contact = np.linalg.inv(pose(0.4)) @ (pose(0.4)[:, 3] - [0, radius, 0, 0])
-    velocity = (pose(0.4 + 1e-5) - pose(0.4 - 1e-5)) / 2e-5
-    assert np.linalg.norm(velocity @ contact) < 1e-6
-    assert np.linalg.norm(velocity[:, 3]) > 0.1
-
-
 @pytest.mark.slow
 def test_thin__objects_move_farther_than_their_width():
     tracer = PathTracer(load_scene("thin"))

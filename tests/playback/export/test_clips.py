@@ -16,7 +16,6 @@ from morgs_mi.io.video import open_frames
 from morgs_mi.playback.export.clips import (
     _frames_backwards,
     named_path,
-    select_frames,
 )
 from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_format
 from morgs_mi.playback.export.frames import exr_channels, pad_to_even
@@ -190,12 +189,6 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
 def test_export__errors_are_one_sentence(stream, tmp_path, capsys, args, message):
     assert run("export", args[0], tmp_path, *args[1:]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
-
-
-def test_select_frames__like_slices(stream, tmp_path):
-    reader = StreamReader(tmp_path / "stream.morgs")
-    selected = {span: select_frames(reader, span) for span in ("2", "1:3", ":2", "::2", "3:")}
-    assert selected == {"2": [2], "1:3": [1, 2], ":2": [0, 1], "::2": [0, 2], "3:": [3]}
 
 
 @pytest.mark.slow

@@ -40,6 +40,7 @@ from tests.playback.viewer.serving import decoded, exact, get, raw, viewing
 from tests.scenes import noise_capture
 from tests.scenes.changing_splats import rig, splats, write_stream
 from tests.scenes.gaussians import isotropic
+from tests.scenes.programs import run_script
 from tests.scenes.short_clip import FRAMES, short_clip
 
 CONNECTIONS = 200
@@ -554,4 +555,4 @@ def test_view__ends_on_ctrl_c(clip):
 @pytest.mark.slow
 def test_starlette__is_not_imported_by_the_other_commands():
     code = "import sys, morgs_mi.cli; sys.exit('starlette' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert run_script(code).returncode == 0

@@ -12,7 +12,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.checks.plots import draw_rig, write_rig
 from morgs_mi.testing import assert_close
-from tests.scenes.cameras import circle, look_at_cameras
 
 
 def test_draw_rig__draws_cameras_at_their_positions():
@@ -38,15 +37,6 @@ def test_draw_rig__draws_cameras_at_their_positions():
     assert_close(np.asarray(cloud.get_offsets()), [(0, 3)], atol=1e-6)
     assert_close(cloud.get_facecolor()[:, :3], [(0, 1, 0)])
     assert np.mean(above.get_xlim()) == pytest.approx(0, abs=1e-6)
-
-
-@pytest.mark.parametrize("count", [1, 8])
-def test_draw_rig__draws_any_rig(count):
-    cameras = look_at_cameras(circle(2 * np.pi * np.arange(count) / count, z=0), 60, up=(0, 0, 1))
-    figure = Figure()
-    draw_rig(figure, cameras, (np.zeros((0, 3)), np.zeros((0, 3))))
-    assert [len(axes.lines) for axes in figure.axes] == [2 * count] * 2
-    figure.canvas.draw()
 
 
 @pytest.mark.filterwarnings("error")
