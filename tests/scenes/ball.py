@@ -1,42 +1,39 @@
 """A ball of Gaussians and its images in four views, which a fit reconstructs."""
 
-from __future__ import annotations
-
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import RenderConfig, rasterize
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.initialise import FirstFrameProblem, from_points
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import QUAD, look_at_cameras
 
 
-def ball(n: int, sh_degree: int = 0) -> Gaussians:
+def ball(n, sh_degree=0):
     """Return n Gaussians in a cube, coloured by position."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.8, 0.8, (n, 3))
     return from_points(points, 0.5 + 0.4 * np.sin(5 * points), sh_degree)
 
 
-def opaque_ball() -> Gaussians:
+def opaque_ball():
     """Return 400 Gaussians, opaque enough to hide what is behind."""
     return dataclasses.replace(ball(400), logit_opacities=np.full(400, 2.0))
 
 
-def views() -> list[Camera]:
+def views():
     """Return four cameras in front of the ball."""
     return look_at_cameras(QUAD, 40)
 
 
-def images_of(gaussians: Gaussians) -> list[np.ndarray]:
+def images_of(gaussians):
     """Return the images [H, W, 3] of the Gaussians in `views`."""
     return [np.clip(np.asarray(rasterize(gaussians, c, ("color",)).color), 0, 1) for c in views()]
 
 
-def bytes_of(images: Sequence[np.ndarray], noise: float = 0.0) -> list[np.ndarray]:
+def bytes_of(images, noise=0.0):
     """Return images as uint8, with normal noise of a standard deviation relative to white."""
     rng = np.random.default_rng(0)
     return [
@@ -45,12 +42,7 @@ def bytes_of(images: Sequence[np.ndarray], noise: float = 0.0) -> list[np.ndarra
     ]
 
 
-def problem(
-    images: Sequence[np.ndarray],
-    start: Gaussians | None = None,
-    masks: Sequence[np.ndarray | None] | None = None,
-    render: RenderConfig | None = None,
-) -> FirstFrameProblem:
+def problem(images, start=None, masks=None, render=None):
     """Return the problem of a first frame with some or all of the `views`."""
     masks = [None] * len(images) if masks is None else masks
     views_of_images = [
@@ -61,6 +53,6 @@ def problem(
     )
 
 
-def mean_psnr(gaussians: Gaussians, images: list[np.ndarray]) -> float:
+def mean_psnr(gaussians, images):
     """Return the mean PSNR of the Gaussians in `views`, dB."""
     return float(np.mean([psnr(a, b) for a, b in zip(images_of(gaussians), images, strict=True)]))

@@ -1,8 +1,5 @@
 """Cameras that look at a scene: on a plane, an arc or a circle."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,29 +9,29 @@ from morgs_mi import Camera
 Point = tuple[float, float, float]
 
 # Four origins in front of the scene.
-QUAD: tuple[Point, ...] = tuple((x, y, -3.5) for x in (-0.9, 0.9) for y in (-0.6, 0.6))
+QUAD = tuple((x, y, -3.5) for x in (-0.9, 0.9) for y in (-0.6, 0.6))
 
 
-def arc(angles: Iterable[float], radius: float, y: float = 0.0) -> list[Point]:
+def arc(angles, radius, y=0.0):
     """Return origins on a horizontal arc in front of the scene, seen along +z at angle 0."""
     return [(radius * np.sin(a), y, -radius * np.cos(a)) for a in angles]
 
 
-def circle(angles: Iterable[float], radius: float = 1.0, z: float = 0.5) -> list[Point]:
+def circle(angles, radius=1.0, z=0.5):
     """Return origins on a circle about the z axis, at height z."""
     return [(radius * np.cos(a), radius * np.sin(a), z) for a in angles]
 
 
 def look_at_cameras(
-    origins: Iterable[Point],
-    fov: float = 50.0,
-    width: int = 64,
-    height: int = 48,
-    names: Sequence[str] | None = None,
+    origins,
+    fov=50.0,
+    width=64,
+    height=48,
+    names=None,
     *,
-    target: Point = (0.0, 0.0, 0.0),
-    up: Point = (0.0, -1.0, 0.0),
-) -> list[Camera]:
+    target=(0.0, 0.0, 0.0),
+    up=(0.0, -1.0, 0.0),
+):
     """Return one camera per origin that looks at `target`, with the names cam0, cam1, ... unless
     `names` are given.
     """
@@ -46,12 +43,12 @@ def look_at_cameras(
     ]
 
 
-def shift_principal_point(camera: Camera, x: float, y: float) -> Camera:
+def shift_principal_point(camera, x, y):
     """Return the camera with its principal point shifted by (x, y) pixels."""
     return replace(camera, K=camera.K + np.array([[0, 0, x], [0, 0, y], [0, 0, 0]]))
 
 
-def make_camera(width: int = 21, height: int = 18) -> Camera:
+def make_camera(width=21, height=18):
     """Return a camera of a size that no block divides, with an off-centre principal point and fx !=
     fy.
     """
@@ -60,12 +57,12 @@ def make_camera(width: int = 21, height: int = 18) -> Camera:
     return Camera(K, camera.viewmat, width, height)
 
 
-def make_wide_camera() -> Camera:
+def make_wide_camera():
     """Return a camera of several tiles; the last blocks extend beyond the image on both sides."""
     return Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 101, 75)
 
 
-def make_sensor_camera() -> Camera:
+def make_sensor_camera():
     """Return `make_camera` with fx = fy, because Mitsuba's sensors have one focal length."""
     camera = make_camera()
     K = camera.K.copy()

@@ -2,22 +2,16 @@
 with (i, t, 0).
 """
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
@@ -29,7 +23,7 @@ FPS = 25
 DOT = np.array([0.25, 0.2, 0.1])
 
 
-def make_camera(i: int, name: str, shift: float = 0.0) -> Camera:
+def make_camera(i, name, shift=0.0):
     """Return the camera at i radians on a circle, with its own focal length and a shifted principal
     point.
     """
@@ -37,36 +31,30 @@ def make_camera(i: int, name: str, shift: float = 0.0) -> Camera:
     return shift_principal_point(view, shift, -shift)
 
 
-def rig(names: tuple[str, ...], shift: float = 0.0) -> list[Camera]:
+def rig(names, shift=0.0):
     """Return cameras on a circle with different focal lengths and principal points `shift` px off
     the centre.
     """
     return [make_camera(i, name, shift) for i, name in enumerate(names)]
 
 
-def frames(i: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]:
+def frames(i, count=COUNT, width=WIDTH):
     """Return the clip of camera i."""
     return [np.full((HEIGHT, width, 3), (i, t, 0), np.uint8) for t in range(count)]
 
 
-def write_image(file: Path, i: int, t: int) -> None:
+def write_image(file, i, t):
     file.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(file), frames(i)[t][..., ::-1])
 
 
-def videos(path: Path, names: tuple[str, ...], suffix: str = ".mkv") -> None:
+def videos(path, names, suffix=".mkv"):
     """Write the clips as .mkv, which can still be read after truncation."""
     for i, name in enumerate(names):
         write_video(path / f"{name}{suffix}", frames(i), FPS)
 
 
-def write_timed_video(
-    path: Path,
-    images: list[np.ndarray],
-    times: Sequence[int],
-    codec: str = "ffv1",
-    rotation: int = 0,
-) -> None:
+def write_timed_video(path, images, times, codec="ffv1", rotation=0):
     """Write a video that shows its frames at `times`, in ascending milliseconds from 0.
 
     Args:
@@ -92,33 +80,29 @@ def write_timed_video(
         container.mux(stream.encode())
 
 
-def n3dv(
-    path: Path, names: tuple[str, ...] = ("cam00", "cam02", "cam11"), clips: Callable = videos
-) -> Path:
+def n3dv(path, names=("cam00", "cam02", "cam11"), clips=videos):
     path.mkdir(parents=True)
     clips(path, names)
     write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * len(names))
     return path
 
 
-def folder_per_camera(path: Path, names: tuple[str, ...], inner: str = "") -> None:
+def folder_per_camera(path, names, inner=""):
     for i, name in enumerate(names):
         write_video(path / name / inner, frames(i), FPS)
 
 
-def folder_per_frame(path: Path, names: tuple[str, ...], inner: str = "") -> None:
+def folder_per_frame(path, names, inner=""):
     for t in range(COUNT):
         for i, name in enumerate(names):
             write_image(path / f"frame{t:06d}" / inner / f"{name}.png", i, t)
 
 
-def meet_room(path: Path, clips: Callable = videos) -> Path:
+def meet_room(path, clips=videos):
     return n3dv(path, ("cam_0", "cam_2", "cam_10"), clips)
 
 
-def colmap_text(
-    folder: Path, cameras: list[Camera], model: str, params: list[list[float]], shared: bool
-) -> None:
+def colmap_text(folder, cameras, model, params, shared):
     """Write a model of cameras with the parameters `params`; if `shared`, all have the first."""
     folder.mkdir(parents=True)
     rows = [
@@ -135,7 +119,7 @@ def colmap_text(
     (folder / "points3D.txt").write_text("1 0.1 0.2 0.3 255 0 51 0.5\n")
 
 
-def colmap(path: Path) -> Path:
+def colmap(path):
     names = ("cam1", "cam2", "cam10")
     cameras = rig(names, shift=3)
     params = [[c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]] for c in cameras]
@@ -144,7 +128,7 @@ def colmap(path: Path) -> Path:
     return path
 
 
-def transforms(path: Path, cameras: list[Camera], k1: float = 0.0) -> None:
+def transforms(path, cameras, k1=0.0):
     """Write a `transforms.json` of cameras that are named as their images."""
     entries = []
     for camera in cameras:
@@ -157,7 +141,7 @@ def transforms(path: Path, cameras: list[Camera], k1: float = 0.0) -> None:
     (path / "transforms.json").write_text(json.dumps(meta))
 
 
-def nerfstudio(path: Path) -> Path:
+def nerfstudio(path):
     path.mkdir(parents=True)
     names = ("cam1", "cam2", "cam10")
     cameras = [
@@ -168,7 +152,7 @@ def nerfstudio(path: Path) -> Path:
     return path
 
 
-def dynamic3dgs(path: Path) -> Path:
+def dynamic3dgs(path):
     ids = (2, 1, 10)
     cameras = rig(tuple(map(str, ids)), shift=3)
     for i, camera in enumerate(cameras):
@@ -189,9 +173,7 @@ def dynamic3dgs(path: Path) -> Path:
     return path
 
 
-def anipose(
-    path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0, 0), clips: Callable = videos
-) -> Path:
+def anipose(path, distortions=(0, 0, 0, 0, 0), clips=videos):
     """Write a calibration of Anipose, beside clips with names that contain the cameras'."""
     path.mkdir(parents=True)
     names = ("camA", "camB", "camC")
@@ -229,7 +211,7 @@ QUALISYS = """  <camera active="1" calibrated="true" serial="{serial}"
 """
 
 
-def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
+def qualisys(path, distortions=(0, 0, 0, 0)):
     """Write a calibration of Qualisys with a marker camera that has no clip, beside clips named
     after the others.
     """
@@ -261,13 +243,7 @@ def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
     return path
 
 
-def dot_clips(
-    path: Path,
-    names: tuple[str, ...],
-    point: np.ndarray,
-    lens: tuple[float, ...],
-    deviation: float = 1.5,
-) -> None:
+def dot_clips(path, names, point, lens, deviation=1.5):
     """Write clips of a bright dot at `point`, `deviation` px wide, recorded through OpenCV's lens
     by the rig with principal points off by 3.
 
@@ -282,20 +258,20 @@ def dot_clips(
         write_video(path / name, [np.repeat(dot[..., None], 3, -1).astype(np.uint8)] * COUNT, FPS)
 
 
-def shown_dot(image: np.ndarray) -> np.ndarray:
+def shown_dot(image):
     """Return the position [2] of the dot of `dot_clips` in an image, with pixel centres at +0.5."""
     weights = np.where(image[..., 0] > 60, image[..., 0], 0).astype(float)
     y, x = np.indices(weights.shape) + 0.5
     return np.array([(weights * x).sum(), (weights * y).sum()]) / weights.sum()
 
 
-def assert_dot_is_shown(capture: Capture) -> None:
+def assert_dot_is_shown(capture):
     """Assert that the images of `dot_clips` show DOT where the cameras project it."""
     for camera, image in zip(capture.cameras, next(capture.frames()).images, strict=True):
         assert_close(shown_dot(image), camera.project(DOT)[0], atol=0.15)
 
 
-def assert_is_rig(capture: Capture) -> None:
+def assert_is_rig(capture):
     """Assert that a capture has the cameras of the rig with their principal points off by 3, and
     their clips.
     """

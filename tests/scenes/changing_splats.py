@@ -1,22 +1,17 @@
 """Splats that move, are born and die, seen by three cameras with z up, and their stream."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import (
-    CodedFrame,
     decode,
     keyframe_packet,
     reemitted_keyframe,
     residual_packet,
 )
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.cameras import look_at_cameras
 
@@ -24,13 +19,13 @@ NAMES = ("left", "middle", "right")
 TARGET = (0, 0, 0.2)
 
 
-def rig(width: int = 64, height: int = 48) -> tuple[Camera, ...]:
+def rig(width=64, height=48):
     """Return three cameras side by side that look along +y."""
     origins = [(x, -4, 1) for x in (-1, 0, 1)]
     return tuple(look_at_cameras(origins, 45, width, height, NAMES, target=TARGET, up=(0, 0, 1)))
 
 
-def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
+def splats(N=40, degree=1, seed=0):
     """Return random splats; the first half has a high confidence."""
     rng = np.random.default_rng(seed)
     return Gaussians.from_activated(
@@ -43,14 +38,7 @@ def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
     )
 
 
-def write_stream(
-    path: Path,
-    frames: int = 4,
-    start: Gaussians | None = None,
-    cameras: tuple[Camera, ...] | None = None,
-    metadata: dict | None = None,
-    keyframe_interval: int = 0,
-) -> list[CodedFrame]:
+def write_stream(path, frames=4, start=None, cameras=None, metadata=None, keyframe_interval=0):
     """Write a stream and return its decoded frames; 0: only the first frame has a
     keyframe.
 

@@ -1,17 +1,11 @@
 """Random clouds with attributes that cover the range of the codec, and encoded clips of them."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
 from hashlib import blake2b
-from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import (
-    CodedFrame,
     decode,
     keyframe_packet,
     reemitted_keyframe,
@@ -23,7 +17,7 @@ from tests.scenes.cameras import look_at_cameras
 CAMERAS = look_at_cameras([(x, 0, -4) for x in (-1, 1)], 50, 160, 120)
 
 
-def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) -> Gaussians:
+def cloud(N=60, degree=1, confidence=True, seed=0):
     """Return random Gaussians in front of `CAMERAS`."""
     rng = np.random.default_rng(seed)
     return Gaussians(
@@ -36,7 +30,7 @@ def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) 
     )
 
 
-def jittered(gaussians: Gaussians, rng: np.random.Generator, share: float = 0.4) -> Gaussians:
+def jittered(gaussians, rng, share=0.4):
     """Return the Gaussians with a share of them changed in all attributes."""
     raw = {
         name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")
@@ -49,9 +43,7 @@ def jittered(gaussians: Gaussians, rng: np.random.Generator, share: float = 0.4)
     return Gaussians(**{name: value + change[name] for name, value in raw.items()})
 
 
-def encoded_clip(
-    frames: int, config: CodecConfig | None = None, degree: int = 1
-) -> tuple[list[Packet], list[CodedFrame]]:
+def encoded_clip(frames, config=None, degree=1):
     """Return the packets and states of a cloud in which Gaussians move, die and are born in every
     frame.
     """
@@ -74,7 +66,7 @@ def encoded_clip(
     return packets, states
 
 
-def write(path: Path, packets: list[Packet], states: list[CodedFrame], every: int = 4) -> None:
+def write(path, packets, states, every=4):
     """Write a stream with a re-emitted keyframe after every `every`-th frame."""
     with StreamWriter(path, CAMERAS, 25) as writer:
         for packet, state in zip(packets, states, strict=True):
@@ -83,7 +75,7 @@ def write(path: Path, packets: list[Packet], states: list[CodedFrame], every: in
                 writer.write(reemitted_keyframe(state))
 
 
-def history(states: Iterable[CodedFrame]) -> str:
+def history(states):
     """Return a digest of all states of a decoder."""
     digest = blake2b()
     for state in states:
@@ -92,7 +84,7 @@ def history(states: Iterable[CodedFrame]) -> str:
     return digest.hexdigest()
 
 
-def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
+def assert_same(got, expected):
     """Assert that two states agree to the bit."""
     assert (got.frame, got.next_id) == (expected.frame, expected.next_id)
     assert np.array_equal(got.digest, expected.digest)

@@ -1,16 +1,12 @@
 """Clips that are cut by an edit list, as programs do that do not encode them again."""
 
-from __future__ import annotations
-
 import struct
-from collections.abc import Sequence
-from pathlib import Path
 
 PER_SECOND = 1000
 """Units of the lengths in an edit list; FFmpeg writes milliseconds."""
 
 
-def show_parts(path: Path, parts: Sequence[tuple[float, float]]) -> Path:
+def show_parts(path, parts):
     """Let an .mp4 or .mov of OpenCV show only parts of itself in succession, given by their starts
     and lengths, s.
 
@@ -33,9 +29,7 @@ def show_parts(path: Path, parts: Sequence[tuple[float, float]]) -> Path:
     return path
 
 
-def with_list(
-    data: bytes, name: bytes, count: int, entries: bytes, parents: Sequence[bytes]
-) -> bytes:
+def with_list(data, name, count, entries, parents):
     """Return an .mp4 with other entries in the box of a list, which changes the sizes of its
     parents.
     """
@@ -49,5 +43,5 @@ def with_list(
     return bytes(grown)
 
 
-def _number(data: bytes | bytearray, at: int) -> int:
+def _number(data, at):
     return struct.unpack(">I", data[at : at + 4])[0]

@@ -4,9 +4,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -31,7 +29,7 @@ class Case:
     every_entry: bool = True
 
 
-def cloud(n: int = 6, seed: int = 5) -> Values:
+def cloud(n=6, seed=5):
     """Return activated attributes of a cloud at the origin, degree 1."""
     rng = np.random.default_rng(seed)
     return {
@@ -46,15 +44,15 @@ def cloud(n: int = 6, seed: int = 5) -> Values:
 
 
 def eye(
-    width: int = 21,
-    height: int = 18,
-    fov: float = 45.0,
-    origin: Any = (0.3, -0.4, -3.0),
-    up: Any = (0, -1, 0),
-    shift: tuple[float, float] = (1.3, -0.7),
-    near: float = 0.01,
-    viewmat: Any = None,
-) -> Camera:
+    width=21,
+    height=18,
+    fov=45.0,
+    origin=(0.3, -0.4, -3.0),
+    up=(0, -1, 0),
+    shift=(1.3, -0.7),
+    near=0.01,
+    viewmat=None,
+):
     """Return a camera that sees the origin, of a size that no block divides, with fx != fy and
     off-centre cx, cy.
     """
@@ -64,13 +62,7 @@ def eye(
     return Camera(K, np.float32(viewmat).astype(np.float64), width, height, near=near)
 
 
-def case(
-    name: str,
-    camera: Camera | None = None,
-    n: int = 6,
-    bounds: dict[str, Any] | None = None,
-    **change: Any,
-) -> Case:
+def case(name, camera=None, n=6, bounds=None, **change):
     """Return the case of the cloud with some attributes replaced, or changed by a function."""
     values = cloud(n)
     for key, new in change.items():
@@ -83,7 +75,7 @@ def case(
     return Case(name, values, camera or eye(), **(bounds or {}))
 
 
-def screen_bound(pixels: float) -> dict[str, float]:
+def screen_bound(pixels):
     """Return the bounds where screen coordinates are as large as `pixels`, given the spacing of
     float32 there.
     """
@@ -93,11 +85,11 @@ def screen_bound(pixels: float) -> dict[str, float]:
     }
 
 
-def scaled(factor: float) -> dict[str, Callable]:
+def scaled(factor):
     return {name: lambda v: v * factor for name in ("means", "scales", "motion")}
 
 
-def moved(*by: float) -> Callable:
+def moved(*by):
     return lambda means: means + np.array(by)
 
 
@@ -131,7 +123,7 @@ SLOW_REFERENCE = {"every_entry": False}
 STIFF_CAMERA = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
 
 
-def stiff_truth() -> Values:
+def stiff_truth():
     """Return raw attributes of a needle seen along its axis before an almost opaque disc."""
     sh_coeffs = np.zeros((2, 4, 3))
     sh_coeffs[:, 0] = [[1.0, 0.2, -0.5], [-0.5, 0.4, 1.0]]
@@ -146,7 +138,7 @@ def stiff_truth() -> Values:
     }
 
 
-def stiff_case() -> Case:
+def stiff_case():
     """Return the case of `stiff_truth`."""
     raw = stiff_truth()
     values = {name: raw[name] for name in ("means", "quats", "sh_coeffs", "motion")}
@@ -310,7 +302,7 @@ CASES_BY_KIND = {
 CASES = [case for cases in CASES_BY_KIND.values() for case in cases]
 
 # What `rasterize` refuses, with the sentence.
-REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+REFUSED = {
     "overflow": (
         {"log_scales": np.full((6, 3), 100.0)},
         r"`scales` must be finite, got inf at \[0, 0\]",
@@ -345,7 +337,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 ONE_PIXEL = Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
 
 
-def stack(n: int, opacity: float) -> Values:
+def stack(n, opacity):
     """Return n Gaussians of various colours behind each other, for a camera at the origin."""
     values = cloud(n)
     values |= {
@@ -356,7 +348,7 @@ def stack(n: int, opacity: float) -> Values:
     return {name: np.float32(value).astype(np.float64) for name, value in values.items()}
 
 
-def million_on_a_pixel() -> dict[str, float]:
+def million_on_a_pixel():
     """Return the relative errors of the image and the gradients of a million faint Gaussians."""
     values = stack(1_000_000, 0.004)
     values["means"][:, :2] = np.random.default_rng(0).normal(size=(1_000_000, 2)) * 0.1
@@ -382,7 +374,7 @@ def million_on_a_pixel() -> dict[str, float]:
     return result
 
 
-def raw_gaussians(**change: Any) -> Gaussians:
+def raw_gaussians(**change):
     values = cloud()
     raw = {name: values[name] for name in ("means", "quats", "sh_coeffs", "motion")}
     raw |= {
@@ -395,7 +387,7 @@ def raw_gaussians(**change: Any) -> Gaussians:
     return gaussians
 
 
-def random_case(seed: int) -> Case:
+def random_case(seed):
     """Return a random mixture of the cases in the table."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 7))

@@ -1,21 +1,18 @@
 """A recording of two textured planes that move in front of others."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from tests.scenes import textured
 
 COUNT = 4
 
 
-def rig() -> list[Camera]:
+def rig():
     """Return four small cameras."""
     return [camera.resized(200, 150) for camera in textured.rig(COUNT)]
 
 
-def film(frames: int) -> list[list[np.ndarray]]:
+def film(frames):
     """Return the clip of each camera."""
     planes = textured.textures()
     clips = []
@@ -27,7 +24,7 @@ def film(frames: int) -> list[list[np.ndarray]]:
     return clips
 
 
-def _moving(t: float) -> list[tuple]:
+def _moving(t):
     """Return the places of the moving planes at frame t."""
     x = 0.9 * np.sin(0.21 * t)
     y = 0.6 * np.sin(0.33 * t + 0.5)

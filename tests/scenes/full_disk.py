@@ -1,14 +1,11 @@
 """A disk on which no file gets larger than a limit, as on one that is full."""
 
-from __future__ import annotations
-
 import resource
-from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 @contextmanager
-def files_end_at(size: int) -> Iterator[None]:
+def files_end_at(size):
     """Let writes beyond `size` bytes of a file fail while the body runs; Python ignores the signal
     of the limit.
     """

@@ -43,14 +43,14 @@ class ExtendedGaussians(Gaussians):
 
 
 def make_scene(
-    degree: int = 1,
-    n: int = 10,
-    seed: int = 5,
+    degree=1,
+    n=10,
+    seed=5,
     *,
-    extent: tuple[float, float, float] = (1.0, 0.8, 0.5),
-    scales: tuple[float, float] = (0.1, 0.4),
-    logits: tuple[float, float] = (-1.5, 1.5),
-) -> Values:
+    extent=(1.0, 0.8, 0.5),
+    scales=(0.1, 0.4),
+    logits=(-1.5, 1.5),
+):
     """Return raw attributes of a random cloud; the default one overlaps and stays clear of cap and
     stop.
 
@@ -74,24 +74,24 @@ def make_scene(
     }
 
 
-def make_wide_scene(n: int = 120) -> Values:
+def make_wide_scene(n=120):
     """Return raw attributes of a cloud that spans several tiles, with no two equal depths."""
     return make_scene(1, n, 7, extent=(1.5, 1.0, 0.5), scales=(0.02, 0.2), logits=(-2, 3))
 
 
-def make_unit_scene(degree: int = 1, n: int = 10) -> Values:
+def make_unit_scene(degree=1, n=10):
     """Return `make_scene` in float32 with unit quaternions, which Mitsuba and PLY files expect."""
     raw = make_scene(degree, n)
     raw["quats"] /= np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     return as_float32(raw)
 
 
-def as_float32(raw: Values) -> Values:
+def as_float32(raw):
     """Return float64 attributes rounded to float32."""
     return {k: np.float32(v).astype(np.float64) for k, v in raw.items()}
 
 
-def to_gaussians(raw: Values, grad: bool = False) -> Gaussians:
+def to_gaussians(raw, grad=False):
     """Return `Gaussians` of raw attributes, with gradients enabled on request."""
     gaussians = Gaussians(**raw)
     if grad:
@@ -104,7 +104,7 @@ def to_gaussians(raw: Values, grad: bool = False) -> Gaussians:
 # --------------------------------------------------------------------------------------------------
 
 
-def isotropic(means: Any, scale: Any, opacity: Any, sh_coeffs: Any = 0.0, **more: Any) -> Gaussians:
+def isotropic(means, scale, opacity, sh_coeffs=0.0, **more):
     """Return isotropic, unrotated Gaussians.
 
     Args:
@@ -122,6 +122,6 @@ def isotropic(means: Any, scale: Any, opacity: Any, sh_coeffs: Any = 0.0, **more
     )
 
 
-def random_sheet(rng: np.random.Generator, n: int, extent: float, z: float) -> np.ndarray:
+def random_sheet(rng, n, extent, z):
     """Return n random points [n, 3] of a square of half size `extent` at depth z."""
     return np.stack([*rng.uniform(-extent, extent, (2, n)), np.full(n, z)], axis=1)

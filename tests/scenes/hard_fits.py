@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi import Camera, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.method.motion_config import MotionConfig
@@ -51,7 +50,7 @@ class HardFit:
     textured: bool = True
 
 
-def scene(textured: bool) -> Gaussians:
+def scene(textured):
     """Return a dense ball of small Gaussians of random colours, or of one grey."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(200, 3))
@@ -61,13 +60,13 @@ def scene(textured: bool) -> Gaussians:
     return isotropic(means, 0.25, 0.9, colors)
 
 
-def eight_bits(images: Images, noise: float = 0.0, frame: int = 0) -> Images:
+def eight_bits(images, noise=0.0, frame=0):
     rng = np.random.default_rng(frame)
     noisy = (image + noise * rng.normal(size=image.shape) for image in images)
     return [np.uint8(np.clip(image, 0, 1) * 255 + 0.5) for image in noisy]
 
 
-def bracketed(images: Images, frame: int) -> Images:
+def bracketed(images, frame):
     """Return 8-bit images whose exposures span a factor of 1000."""
     factors = np.geomspace(1000**-0.5, 1000**0.5, len(images))
     lights = (decode_light(image) * f for image, f in zip(images, factors, strict=True))
@@ -88,9 +87,7 @@ HARD_FITS = [
 ]
 
 
-def fitted(
-    fit: HardFit, num_frames: int | None = None
-) -> Iterator[tuple[float, dict[str, Any], str]]:
+def fitted(fit, num_frames=None):
     """Yield the PSNR of the first view against the truth, the raw attributes and the status of each
     frame.
     """

@@ -1,9 +1,6 @@
 """A clip of `filmed` as videos that are played in a loop, and its calibration."""
 
-from __future__ import annotations
-
 from functools import cache
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -21,13 +18,13 @@ CONFIG = quick(num_gaussians=1500, first_frame_steps=150, epochs=2)
 
 
 @cache
-def clips() -> list[list[np.ndarray]]:
+def clips():
     """Return the clip of each camera: 16 frames that swing to and fro and can be repeated."""
     forth = filmed.film(9)
     return [[*clip, *clip[-2:0:-1]] for clip in forth]
 
 
-def write_calibration(path: Path) -> Path:
+def write_calibration(path):
     """Write the calibration of the cameras with a photo of each, and points on the planes."""
     rng = np.random.default_rng(0)
     points, colors = textured.points(rng, 1500)
@@ -37,7 +34,7 @@ def write_calibration(path: Path) -> Path:
     return path
 
 
-def write_videos(folder: Path) -> list[Path]:
+def write_videos(folder):
     """Write the clip of each camera as a video and return their paths."""
     paths = [folder / f"{name}.mkv" for name in NAMES]
     for path, clip in zip(paths, clips(), strict=True):
@@ -45,7 +42,7 @@ def write_videos(folder: Path) -> list[Path]:
     return paths
 
 
-def connection(*images: np.ndarray, opens: bool = True) -> Mock:
+def connection(*images, opens=True):
     """Return what OpenCV opens: a camera or an address that delivers some images."""
     reads = [(True, image) for image in images] + [(False, None)] * 99
     return Mock(**{"isOpened.return_value": opens, "read.side_effect": reads})

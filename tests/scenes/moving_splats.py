@@ -1,16 +1,11 @@
 """Five splats that move along x in equal steps, seen by two cameras, and their stream."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.gaussians import isotropic
 
 WIDTH = 40
@@ -29,7 +24,7 @@ EXACT = CodecConfig(quality=1e5)
 PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE
 
 
-def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
+def moved(frame, logit=0.0):
     """Return five splats in the plane z = 0 after `frame` steps along x, with a confidence unless
     `logit` is None.
     """
@@ -40,12 +35,7 @@ def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
     return isotropic(means, 0.2, 0.9, sh, **more)
 
 
-def write_stream(
-    path: Path,
-    metadata: dict,
-    logit: float | None = 0.0,
-    shift: float = 0,
-) -> list[Packet]:
+def write_stream(path, metadata, logit=0.0, shift=0):
     """Write the stream of the splats, shifted by `shift` steps, and return its packets."""
     first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
     state = decode(None, first)

@@ -1,9 +1,5 @@
 """A Mitsuba scene of Gaussians with the integrator `gaussian_splat`."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import mitsuba as mi
 
 from morgs_mi import ellipsoids
@@ -12,9 +8,7 @@ from tests.scenes.cameras import make_sensor_camera
 AOVS = "motion,confidence,depth"
 
 
-def make_mitsuba_scene(
-    gaussians: Any, film: dict | None = None, sensor: dict | None = None, **props: Any
-) -> Any:
+def make_mitsuba_scene(gaussians, film=None, sensor=None, **props):
     """Return a Mitsuba scene of one shape, `make_sensor_camera` and the integrator `gaussian_splat`
     with `props`.
     """

@@ -4,8 +4,6 @@
 itself within the write that brings the bytes written to that many.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -52,7 +50,7 @@ class Recording(Capture):
         return {"layout": "noise"}
 
 
-def recording(**changes) -> Recording:
+def recording(**changes):
     """Return the recording, with some fields replaced."""
     rng = np.random.default_rng(1)
     views = look_at_cameras([(x, 0, -3) for x in (-1, 0, 1)], 60, 32, 24)
@@ -71,7 +69,7 @@ def recording(**changes) -> Recording:
     return Recording(**(fields | changes))
 
 
-def write_recording(path: Path, num_frames: int = FRAMES) -> Path:
+def write_recording(path, num_frames=FRAMES):
     """Write the recording as a capture of PNG files, which other processes can open."""
     scene = recording(num_frames=num_frames)
     write_colmap(path / "sparse" / "0", scene.cameras, scene.points, scene.point_colors)
@@ -84,14 +82,14 @@ def write_recording(path: Path, num_frames: int = FRAMES) -> Path:
 class Dying:
     """A file that kills its process after `left` more bytes."""
 
-    def __init__(self, file, left: int) -> None:
+    def __init__(self, file, left):
         self.file = file
         self.left = left
 
     def __getattr__(self, name):
         return getattr(self.file, name)
 
-    def write(self, data) -> int:
+    def write(self, data):
         done = self.file.write(data[: self.left])
         self.left -= done
         if not self.left:

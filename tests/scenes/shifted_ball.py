@@ -1,17 +1,14 @@
 """A ball that moves as a whole into the next frame, for tests of shared motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
-from morgs_mi import Gaussians, RenderConfig
+from morgs_mi import RenderConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
+from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.ssim import Target
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
@@ -21,15 +18,13 @@ PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=Fa
 FIT = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
 
 
-def shifted_ball() -> Gaussians:
+def shifted_ball():
     """Return the ball after its motion."""
     ball = opaque_ball()
     return replace(ball, means=np.asarray(ball.means) + SHIFT)
 
 
-def fit_shifted(
-    motion: MotionConfig, start: MotionStart | None = None, config: FitConfig = FIT
-) -> LaterFrame:
+def fit_shifted(motion, start=None, config=FIT):
     """Fit the ball to images of its shifted self, with the same bytes on every run."""
     ball = opaque_ball()
     active = full_active_set(ball, dict(enumerate(views())), RenderConfig())
@@ -38,11 +33,11 @@ def fit_shifted(
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 
-def motion_error(result: LaterFrame) -> float:
+def motion_error(result):
     """Return the mean error of the displacements, in world units."""
     return float(np.linalg.norm(np.asarray(result.gaussians.motion) - SHIFT, axis=1).mean())
 
 
-def psnr_of(result: LaterFrame) -> float:
+def psnr_of(result):
     """Return the mean PSNR against the shifted ball, in dB."""
     return mean_psnr(result.gaussians, images_of(shifted_ball()))

@@ -51,7 +51,7 @@ class Clip(NamedTuple):
     states: dict[int, CodedFrame]
 
 
-def short_clip() -> Clip:
+def short_clip():
     """Return a stream in which every frame has a birth and a death, with a keyframe after every
     third frame.
     """
@@ -77,7 +77,7 @@ def short_clip() -> Clip:
     return Clip(data, pieces_of(data), {state.frame: state for state in states})
 
 
-def pieces_of(data: bytes) -> list[Piece]:
+def pieces_of(data):
     """Return the places of the preamble and the packets of a stream."""
     pieces = [Piece(-1, 0, 0, 12)]
     while (at := pieces[-1].stop) < len(data):
@@ -86,7 +86,7 @@ def pieces_of(data: bytes) -> list[Piece]:
     return pieces
 
 
-def sealed(payload: bytes, kind: int = 2, frame: int = 0) -> bytes:
+def sealed(payload, kind=2, frame=0):
     """Return a packet with the right length and the right CRC."""
     head = struct.pack("<IIQ", kind, frame, len(payload))
     return head + struct.pack("<I", zlib.crc32(head + payload)) + payload

@@ -1,15 +1,10 @@
 """Mitsuba scenes of Gaussians among surfaces, seen along +z from z = -4."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi import Camera, Gaussians, ellipsoids
+from morgs_mi import Camera, ellipsoids
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import isotropic
@@ -17,19 +12,19 @@ from tests.scenes.gaussians import isotropic
 COLOR = (0.6, 0.3, 0.1)
 
 
-def camera(width: int = 32, height: int = 24, fov: float = 45.0) -> Camera:
+def camera(width=32, height=24, fov=45.0):
     """Return the camera of these scenes."""
     return look_at_cameras([(0, 0, -4)], fov, width, height)[0]
 
 
-def cloud(z: float = 0.0, n: int = 40, seed: int = 3, opacity: float = 0.7) -> Gaussians:
+def cloud(z=0.0, n=40, seed=3, opacity=0.7):
     """Return small Gaussians of random colours in a square at depth z."""
     rng = np.random.default_rng(seed)
     means = np.stack([*rng.uniform(-1.2, 1.2, (2, n)), np.full(n, z)], axis=1)
     return isotropic(means, 0.1, opacity, rng.uniform(-1, 1, (n, 1, 3)))
 
 
-def wall(z: float, size: float = 5.0, **entries: Any) -> dict[str, Any]:
+def wall(z, size=5.0, **entries):
     """Return a square of half width `size` at depth z that faces the camera."""
     transform = mi.ScalarTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale(size)
     return {
@@ -39,13 +34,13 @@ def wall(z: float, size: float = 5.0, **entries: Any) -> dict[str, Any]:
     }
 
 
-def glowing(color: Any = COLOR) -> dict[str, Any]:
+def glowing(color=COLOR):
     """Return the entries of a black shape that emits linear light of a colour, without noise."""
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(color)}}
     return {"bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": emitter}
 
 
-def mirrored(color: float, opacity: float, n: int) -> tuple[Gaussians, Camera, Camera, dict]:
+def mirrored(color, opacity, n):
     """Return n Gaussians behind a camera, the camera, its mirror image, and the mirror at z = 0.
 
     Coefficients have the standard deviations `color` in degree 0 and 0.1 in degree 1.
@@ -66,13 +61,7 @@ LAMP = {
 }
 
 
-def scene(
-    gaussians: Gaussians,
-    surfaces: str | dict = "path",
-    film: dict | None = None,
-    view: Camera | None = None,
-    **more: Any,
-) -> Any:
+def scene(gaussians, surfaces="path", film=None, view=None, **more):
     """Return the scene of Gaussians and `more`, with the plugin's nested integrator `surfaces`, and
     its `props`.
     """
@@ -89,14 +78,12 @@ def scene(
     )
 
 
-def render(scene: Any, spp: int = 4, **more: Any) -> np.ndarray:
+def render(scene, spp=4, **more):
     """Return the image of a scene in float64."""
     return np.asarray(mi.render(scene, spp=spp, **more), np.float64)
 
 
-def slopes_of(
-    scene: Any, name: str, step: float, loss: Callable[[Any], Any], spp: int
-) -> tuple[float, float]:
+def slopes_of(scene, name, step, loss, spp):
     """Return the slope of a loss of the image along a parameter, by its gradient and by central
     differences.
 
@@ -119,9 +106,7 @@ def slopes_of(
     return float(np.vdot(gradient, direction)), (losses[0] - losses[1]) / (2 * step)
 
 
-def slopes_of_both_modes(
-    scene: Any, names: Iterable[str], weights: Any, spp: int = 64
-) -> tuple[float, float]:
+def slopes_of_both_modes(scene, names, weights, spp=64):
     """Return the slope of the weighted sum of the image along all parameters, in reverse and in
     forward mode.
     """

@@ -1,15 +1,11 @@
 """Images of textured planes from known cameras, rendered exactly by homographies."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
@@ -25,7 +21,7 @@ _PLANES = (
 )
 
 
-def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0) -> list[Camera]:
+def rig(count=6, width=320, height=240, shift=0.0):
     """Return cameras on an arc in front of the planes, with principal points `shift` px off the
     centre.
     """
@@ -37,7 +33,7 @@ def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0)
     return cameras
 
 
-def write_capture(path: Path) -> Capture:
+def write_capture(path):
     """Write and read six cameras with off-centre principal points and one frame, without points."""
     cameras = rig(shift=7)
     planes = textures()
@@ -47,14 +43,14 @@ def write_capture(path: Path) -> Capture:
     return load_capture(path)
 
 
-def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> Capture:
+def with_cameras(capture, change):
     """Return the capture with the cameras that `change` returns for an index and a camera."""
     return replace(
         capture, cameras=tuple(change(i, camera) for i, camera in enumerate(capture.cameras))
     )
 
 
-def turned(camera: Camera, degrees: float) -> Camera:
+def turned(camera, degrees):
     """Return the camera rotated about its optical axis."""
     c = np.cos(np.deg2rad(degrees))
     s = np.sin(np.deg2rad(degrees))
@@ -65,7 +61,7 @@ def turned(camera: Camera, degrees: float) -> Camera:
     )
 
 
-def textures() -> list[np.ndarray]:
+def textures():
     """Return one texture per plane, RGB uint8, with detail at several scales."""
     rng = np.random.default_rng(0)
     images = []
@@ -78,12 +74,7 @@ def textures() -> list[np.ndarray]:
     return images
 
 
-def render(
-    camera: Camera,
-    planes: Sequence[np.ndarray],
-    places: Sequence[tuple] = _PLANES,
-    background: np.ndarray | None = None,
-) -> np.ndarray:
+def render(camera, planes, places=_PLANES, background=None):
     """Return the image of the planes in a camera, RGB uint8 [H, W, 3], in front of a `background`
     image.
     """
@@ -115,7 +106,7 @@ def render(
     return image
 
 
-def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+def points(rng, count):
     """Return random points [count, 3] on the planes, and their colours in [0, 1]."""
     corners, across, down = (np.array(column) for column in zip(*_PLANES, strict=True))
     rows = rng.integers(0, len(corners), count)
@@ -128,7 +119,7 @@ def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray
     ] / 255
 
 
-def distance_to_planes(points: np.ndarray) -> np.ndarray:
+def distance_to_planes(points):
     """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite),
     world units.
     """

@@ -1,10 +1,5 @@
 """Networks of a few operators with known flow, exported as ONNX files."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 import onnx
 import onnx.parser
@@ -15,14 +10,12 @@ OF_IMAGE = np.array([[0.1, 0.2, 0.3], [0.02, 0.05, 0.01]], np.float32)
 OF_OTHER = np.array([[-0.3, 0.1, 0.2], [0.04, 0.03, -0.02]], np.float32)
 
 
-def known_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+def known_flow(image, other):
     """Return the network's flow [H, W, 2] for two images [H, W, 3] in its own range of values."""
     return image @ OF_IMAGE.T + other @ OF_OTHER.T
 
 
-def export(
-    path: Path, height: int | str = "h", width: int | str = "w", inputs: int = 2, channels: int = 2
-) -> Path:
+def export(path, height="h", width="w", inputs=2, channels=2):
     """Write a network with RAFT's signature: it takes two images and returns flow at an eighth and
     at the full size.
 
@@ -52,7 +45,7 @@ def export(
     )
 
 
-def export_lookup(path: Path, height: int, width: int) -> Path:
+def export_lookup(path, height, width):
     """Write a network that looks up the second image in the first one's grid turned by 180 degrees,
     as RAFT looks up correlations: the flow is the difference of red and of green, at half weight.
     """
@@ -69,12 +62,12 @@ def export_lookup(path: Path, height: int, width: int) -> Path:
 
 
 def squared_difference(
-    path: Path,
-    height: int,
-    width: int,
-    spatial: bool = True,
-    inputs: Sequence[str] = ("in0", "in1"),
-) -> Path:
+    path,
+    height,
+    width,
+    spatial=True,
+    inputs=("in0", "in1"),
+):
     """Write the network mean((in0 - in1)^2) over the channels, or over all, with the signature of
     LPIPS; inputs [1, 3, height, width].
     """
@@ -88,7 +81,7 @@ def squared_difference(
     return write(path, graph)
 
 
-def write(path: Path, graph: str, **constants: np.ndarray) -> Path:
+def write(path, graph, **constants):
     """Write the network of a graph in ONNX's text format, with constants by their names."""
     parsed = onnx.parser.parse_graph(graph)
     parsed.initializer.extend(numpy_helper.from_array(v, name) for name, v in constants.items())
