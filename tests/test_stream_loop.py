@@ -221,25 +221,6 @@ def test_push__fits_views_at_their_own_times(clip):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("motion", "losses"),
-    [
-        (
-            MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False),
-            {"recon"},
-        ),
-        (
-            MotionConfig(key_views=2, mask_interval=1, learn_offset=False),
-            {"recon", "flow", "mask"},
-        ),
-    ],
-)
-def test_push__modules_can_be_switched_off(clip, motion, losses):
-    _, _, reports = run(clip, dataclasses.replace(SHORT, motion=motion), frames=2)
-    assert reports[1].losses.keys() == losses
-
-
-@pytest.mark.slow
 def test_push__replaces_too_few_points_and_reports_it(clip):
     """Half of the Gaussians are seeded, the others are added by density control."""
     nothing = np.zeros((0, 3))

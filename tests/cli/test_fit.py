@@ -16,16 +16,13 @@ import pytest
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.io.video import VideoReader
-from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.cluster.chunks import ChunkedRun
 from morgs_mi.runs.cluster.tasks import ChunkConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.quick import OPTIONS
-from tests.scenes import textured
 from tests.scenes.captures import colmap
 from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
 from tests.scenes.recording import write_recording
@@ -50,21 +47,6 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
     assert [frame["views"]["cam1"]["psnr"] is None for frame in frames] == [False, True, True]
     assert all(frame["psnr"] > 0 for frame in frames)
-
-
-@pytest.mark.slow
-def test_fit__balances_cameras_of_other_exposure(tmp_path, run):
-    path = textured.write_capture(tmp_path / "rig").path
-    camera = textured.rig(shift=7)[2]
-    light = decode_light(textured.render(camera, textured.textures()) / 255)
-    brighter = np.rint(255 * np.clip(encode_light(1.25 * light), 0, 1)).astype(np.uint8)
-    write_video(path / "cam2.mkv", [brighter], 30)
-    (tmp_path / "a.toml").write_text("[fit.short_fits]\ngaussians = 40\nsteps = 2\nrounds = 1\n")
-    quick = (*OPTIONS, "--downscale", 2, "--config", tmp_path / "a.toml")
-    for options, is_balanced in ((("--exposure", "on"), True), (("--exposure", "off"), False)):
-        status, output, _ = run("fit", path, tmp_path / "out", *quick, *options)
-        assert status == 0
-        assert ("The cameras were balanced: exposures differ by up to" in output) == is_balanced
 
 
 @pytest.mark.slow

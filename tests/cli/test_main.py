@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 
-import cv2
 import pytest
 
 from morgs_mi.cli.main import main
@@ -209,33 +208,3 @@ def test_main__prints_a_traceback_with_debug(tmp_path, run):
     assert status == 1
     assert "Traceback" in error
     assert "load_capture" in error
-
-
-@pytest.mark.slow
-def test_main__goes_from_a_scene_to_an_evaluation(tmp_path, run):
-    clip = tmp_path / "clip"
-    out = tmp_path / "out"
-    size = ("--width", 64, "--height", 48, "--spp", 4)
-    assert run("synth", "spheres", clip, "--cameras", 4, "--frames", 3, *size)[0] == 0
-    fit = ("--hold-out", 0, "--num-gaussians", 600, "--first-frame-steps", 60, "--epochs", 2)
-    status, output, _ = run("fit", clip, out, *fit)
-    assert status == 0
-    assert "stream.morgs: 3 frames" in output
-
-    status, output, _ = run("eval", out, "--json", "-")
-    assert status == 0
-    result = json.loads(output)
-    assert (result["held_out"], list(result["views"]), result["num_frames"]) == (True, ["cam00"], 3)
-    assert result["psnr"]["mean"] > 15
-    assert result["bytes"]["file"] == (out / "stream.morgs").stat().st_size
-    assert 0 < result["frames"][1]["motion_error_moving"] < 10
-    assert result["frames"][1]["seconds"] > 0
-    status, output, _ = run("eval", out, "--json", tmp_path / "eval.json")
-    assert status == 0
-    assert "held-out view cam00" in output
-    assert json.loads((tmp_path / "eval.json").read_text())["psnr"] == result["psnr"]
-
-    assert run("render", out, "--camera", "cam02")[0] == 0
-    video = cv2.VideoCapture(str(out / "cam02.mp4"))
-    assert [video.read()[1].shape for _ in range(3)] == [(48, 64, 3)] * 3
-    assert not video.read()[0]

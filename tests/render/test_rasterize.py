@@ -137,16 +137,6 @@ def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
     assert_close(image.color, expected["color"], atol=tol.STOPPED_IMAGE_ABS)
 
 
-def test_rasterize__blends_equal_depths_in_the_order_of_the_input():
-    raw = as_float32(make_scene(0, 2))
-    raw["means"][:] = 0
-    raw["quats"][:] = (1, 0, 0, 0)
-    raw["sh_coeffs"][:] = np.array([1.0, -1.0])[:, None, None]
-    camera = make_camera()
-    image = rasterize(to_gaussians(raw), camera).color
-    assert_close(image, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
-
-
 def test_rasterize__of_no_gaussians_is_the_background():
     empty = Gaussians(
         np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3))

@@ -38,20 +38,6 @@ def test_thin__objects_move_farther_than_their_width():
     assert opened.sum() < 0.15 * truth.mask.sum()
 
 
-@pytest.mark.slow
-def test_flicker__images_change_where_surfaces_are_static():
-    tracer = PathTracer(load_scene("flicker"))
-    camera = tracer.scene.rig.cameras(3, 160, 120)[0]
-    images, truths = zip(*(render_frame(tracer, camera, frame) for frame in range(6)), strict=True)
-    still = ~np.any([truth.mask for truth in truths], axis=0)
-    light = np.array([image[still].mean(axis=-1) for image in images])
-    means = light.mean(axis=1)
-    assert (np.abs(np.diff(means)) / means[1:] > 0.01).sum() >= 4
-    # The lamp swings: the shading changes by more than a common factor.
-    shading = light / means[:, None]
-    assert np.percentile(np.abs(shading[0] - shading[-1]), 95) > 0.05
-
-
 def test_rig__test_view_is_at_the_centre():
     cameras = load_scene("spheres").rig.cameras(10, 320, 240)
     positions = np.array([camera.position for camera in cameras])

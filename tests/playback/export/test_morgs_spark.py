@@ -183,15 +183,6 @@ def test_module__repeats(scene, seconds, frame):
     scene.wait(f"splats.position === {frame}")
 
 
-def test_module__knows_the_size_of_a_frame(scene, clip):
-    scene.show(0)
-    means = clip[1][0].gaussians.numpy()["means"]
-    box = scene.page.evaluate(
-        "(({min, max}) => [min.toArray(), max.toArray()])(splats.mesh.getBoundingBox())"
-    )
-    assert np.allclose(box, [means.min(axis=0), means.max(axis=0)], atol=1e-4)
-
-
 def test_module__refuses_what_it_cannot_play(browser, site):
     with Scene(browser, f"{site[1]}/scene.html") as scene:
         for name, reason in (

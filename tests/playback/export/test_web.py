@@ -276,30 +276,12 @@ def test_page__steps_to_frames_that_are_being_decoded(page):
     assert page.page.evaluate("player.playback.decodeTimes.length") <= decoded + 3
 
 
-def test_page__has_no_controls_that_need_a_server(page):
-    page.page.keyboard.press("v")
-    page.page.keyboard.press("x")
-    page.wait("player.settled")
-    assert (
-        page.page.locator(".of-server, #recording, #rendering, #share, #split")
-        .locator("visible=true")
-        .count()
-        == 0
-    )
-
-
 def test_page__opens_on_the_first_frame_with_motion(browser, clip):
     with Player(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
         assert page.text("#count") == f"1 / {FRAMES - 1}"
     with Player(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=0&mode=motion") as page:
         assert page.text("#count") == f"0 / {FRAMES - 1}"
         assert "The first frame has no motion." in page.text("#legend")
-
-
-def test_page__leaves_the_first_frame_when_a_mode_is_chosen_that_shows_motion(page):
-    page.page.get_by_text("Motion", exact=True).first.click()
-    page.wait("player.playback.position === 1 && player.settled")
-    assert "first frame" not in page.text("#legend").lower()
 
 
 # Sorting waits for `sortAll`.
@@ -334,14 +316,6 @@ def test_page__draws_a_new_mode_when_its_values_arrive(browser, clip):
         page.page.evaluate("player.selectMode('confidence')")
         page.wait("player.settled")
         assert psnr(page.image() / 255, arrived / 255) > 40
-
-
-def test_page__repeats(page):
-    page.page.evaluate("player.selectSpeed(5)")
-    shown = page.page.evaluate("player.playback.decodeTimes.length")
-    page.page.get_by_label("Play", exact=True).click()
-    page.wait(f"player.playback.decodeTimes.length > {shown + 2 * FRAMES}")
-    assert page.page.evaluate("player.playback.playing")
 
 
 VIEW = ("camera.position", "controls.target")

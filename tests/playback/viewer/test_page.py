@@ -182,24 +182,6 @@ def test_page__shows_the_image_of_rasterize_when_the_view_rests(browser, clip, u
         assert not page.errors
 
 
-def test_page__two_at_once_have_their_own_views(browser, clip, url):
-    wishes = "pause&exact&frame={}&camera={}"
-    with (
-        Viewed(browser, url, wishes.format(1, "left")) as left,
-        Viewed(browser, url, wishes.format(2, "right")) as right,
-    ):
-        for page, frame, index in ((left, 1, 0), (right, 2, 2)):
-            page.wait(f"player.settled && {RENDERING}")
-            image = rasterize(clip[1][frame].gaussians, rig(WIDTH, HEIGHT)[index], ("color",)).color
-            assert (
-                np.abs(
-                    page.exact_image() - channel_image("color", np.array(image)).astype(int)
-                ).max()
-                <= 3
-            )
-            assert not page.errors
-
-
 def test_page__names_a_damaged_packet(browser, tmp_path):
     write_stream(tmp_path / "stream.morgs")
     data = bytearray((tmp_path / "stream.morgs").read_bytes())
