@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.splats import without_invalid
 from tests.scenes.changing_splats import splats
 

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.render.active_view import ActiveView, backproject, make_active_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from morgs_mi.codec.container import header_json
-from morgs_mi.core.camera import Camera
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer.server import Viewer
 
