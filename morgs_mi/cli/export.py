@@ -21,8 +21,10 @@ from morgs_mi.cli.settings import (
 )
 from morgs_mi.cli.streams import (
     FRAMES,
+    Background,
     DropInvalid,
     ExportKind,
+    on_background,
     opened,
     relative_to,
     shown_exposure,
@@ -86,6 +88,7 @@ class Flight(ExportKind):
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[ChannelName, ...] = ("color",)
     """Channels to render, side by side."""
+    background: Background = None
     display_exposure: DisplayExposure = None
 
     formats = VIDEO
@@ -101,6 +104,7 @@ class Flight(ExportKind):
         )
         from morgs_mi.playback.export.frames import write_images
 
+        on_background(stream, self.background)
         numbers = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in numbers:
             raise ValueError(
@@ -128,6 +132,7 @@ class Web(ExportKind):
     by default OUT/player.html or OUT/web."""
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
+    background: Background = None
 
     formats = WEB
     drawn = True
@@ -136,6 +141,12 @@ class Web(ExportKind):
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
 
+        if self.background is not None and chosen.folder:
+            raise ValueError(
+                f"--background is for FILE.html, got the folder {output}, which has the stream "
+                "unchanged."
+            )
+        on_background(stream, self.background)
         total = len(frame_numbers(stream))
         write = write_web_folder if chosen.folder else write_web_page
         size = write(stream, output, self.title, lambda done: report("Checking", done, total))

@@ -10,7 +10,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress, quantity
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, options
-from morgs_mi.cli.streams import DropInvalid, opened, shown_exposure
+from morgs_mi.cli.streams import Background, DropInvalid, on_background, opened, shown_exposure
 from morgs_mi.core.extras import extra
 from morgs_mi.playback.export.formats import IMAGES, destination
 
@@ -77,6 +77,10 @@ class Render:
     light: Literal["probe", "traced"] = "probe"
     """Light of an inserted scene: an environment map at its middle, or rays traced through the
     Gaussians, for their shadows and reflections."""
+    background: Background = None
+    """Colour behind the Gaussians: black, grey, white, #rrggbb, or transparent, for PNG files with
+    straight alpha in sRGB; by default the fit's, which is usually black.
+    """
     display_exposure: DisplayExposure = None
     drop_invalid: DropInvalid = False
     skip_damaged: Flag = False
@@ -106,6 +110,14 @@ class Render:
         output, chosen = destination(stream.path, self.output, IMAGES, stem)
         single = chosen.folder and chosen.is_file(output)
         channels = self.channels or (None if chosen.name == "exr" else ("color",))
+        is_transparent = self.background == "transparent"
+        if is_transparent:
+            if chosen.name != "png" or self.insert is not None or channels != ("color",):
+                raise ValueError(
+                    "--background transparent is for the colour in PNG files, got another output."
+                )
+            channels = ("color", "alpha")
+        on_background(stream, "black" if is_transparent else self.background)
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
@@ -128,6 +140,7 @@ class Render:
                 output,
                 lambda done: report("Rendering", done, count),
                 shown_exposure(stream, self.display_exposure),
+                is_transparent,
             )
         print_result(f"{output}: {quantity(count, 'image')}.")
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import options
@@ -24,6 +26,37 @@ DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_
 """Option of the commands that read files of Gaussians."""
 _SPAN = "Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."
 FRAMES = arg(metavar="FRAMES", help_behavior_hint="", help=_SPAN)
+
+
+_BACKGROUND = (
+    "Colour behind the Gaussians: black, grey, white or #rrggbb; by default the fit's, which is "
+    "usually black."
+)
+Background = Annotated[
+    str | None, DisallowNone, arg(metavar="COLOR", help_behavior_hint="", help=_BACKGROUND)
+]
+"""Option of the commands that draw a stream."""
+_COLORS = {"black": "#000000", "grey": "#808080", "white": "#ffffff"}
+
+
+def on_background(stream: FrameSource, color: str | None) -> None:
+    """Draw a stream over another colour, None: over its own.
+
+    Raises:
+        ValueError: it is no colour.
+    """
+    from morgs_mi.playback.stream_header import render_config
+
+    if color is None:
+        return
+    match = re.fullmatch("#" + 3 * "([0-9a-f]{2})", _COLORS.get(color, color.lower()))
+    if match is None:
+        names = ", ".join(_COLORS)
+        raise ValueError(f"--background must be {names} or #rrggbb, got {color}.")
+    background = tuple(int(digits, 16) / 255 for digits in match.groups())
+    render = asdict(replace(render_config(stream), background=background))
+    config = stream.metadata.get("config", {})
+    stream.metadata = {**stream.metadata, "config": {**config, "render": render}}
 
 
 def opened(

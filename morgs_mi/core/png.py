@@ -7,5 +7,6 @@ import numpy as np
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """Return an image, uint8 RGB [H, W, 3], as a PNG file."""
-    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    """Return an image, uint8 RGB [H, W, 3] or RGBA [H, W, 4], as a PNG file."""
+    order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    return cv2.imencode(".png", cv2.cvtColor(image, order))[1].tobytes()

@@ -159,7 +159,8 @@ class Viewer:
         return _stream_response(self._newest(), request)
 
     def _send_recorded(self, request: Request) -> Response:
-        image = self._recorded.at(StreamReader(self._path, follow=False), **request.path_params)
+        stream = StreamReader(self._newest(), follow=False)
+        image = self._recorded.at(stream, **request.path_params)
         return Response(
             cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg"
         )

@@ -484,6 +484,11 @@ def test_viewer__sends_recorded_images_as_jpeg(live):
             response, content = get(url, path)
             assert response.status == 400
             assert b"expected a camera and a frame of the stream" in content
+        # The frame is provisional as long as the stream has none.
+        stream = folder / "stream.morgs"
+        (folder / PROVISIONAL).write_bytes(stream.read_bytes())
+        stream.write_bytes(stream.read_bytes()[: open_stream(folder).index()[0][2]])
+        assert get(url, "recorded/1/0")[0].status == 200
 
 
 def test_viewer__names_a_capture_that_is_missing(clip, url, tmp_path):
