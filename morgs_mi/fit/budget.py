@@ -32,6 +32,8 @@ from morgs_mi.fit.first_frame import LAST_ROUND
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, half_sized
 
+# Seconds of a first frame without a limit, on the reference machine.
+_SECONDS = 120.0
 # Seconds of a step per Gaussian, and per pixel of its view.
 _GAUSSIAN_SECONDS = 2.2e-7
 _PIXEL_SECONDS = 0.5e-7
@@ -69,6 +71,7 @@ def plan_first_frame(
     if None not in (config.num_gaussians, config.first_frame_steps):
         return config, None
     plan = config
+    limit = config.first_frame_seconds or _SECONDS
     # Mean numbers of pixels of a view, and of one of half the size.
     pixels, half_pixels = (
         float(np.mean([view.camera.width * view.camera.height for view in some]))
@@ -94,11 +97,11 @@ def plan_first_frame(
         too_many = bisect_left(
             range(least + 1, most + 1),
             True,
-            key=lambda n: seconds(replace(plan, num_gaussians=n)) > config.first_frame_seconds,
+            key=lambda n: seconds(replace(plan, num_gaussians=n)) > limit,
         )
         plan = replace(plan, num_gaussians=least + too_many)
     if config.first_frame_steps is None:
-        affordable = int(plan.planned_steps * config.first_frame_seconds / seconds(plan))
+        affordable = int(plan.planned_steps * limit / seconds(plan))
         steps = max(_LEAST_STEPS, min(plan.planned_steps, affordable))
         plan = replace(plan, first_frame_steps=steps)
     return plan, seconds(plan)

@@ -14,9 +14,10 @@ noise and the angles between them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -110,6 +111,47 @@ LAST_ROUND = 0.5
 _FINAL_RATE = 0.1
 
 
+# Steps after which the clock is read, under a limit.
+_CHECKED = 20
+# Least number of steps under a limit.
+_LEAST_STEPS = 50
+# Time of a step with the full images relative to one with half of them.
+_LATE = 2.0
+
+
+class _Pace:
+    """Planned steps of a fit, some of which are skipped evenly if it would exceed a limit of the
+    clock.
+    """
+
+    def __init__(self, steps: int, limit: float | None) -> None:
+        self._steps = steps
+        self._limit = limit
+        self._begin = self._checked = time.perf_counter()
+        self._stride = 1.0
+        self.position = 0.0  # planned steps that are done
+        self.count = 0  # steps that were made
+
+    def views(self, order: Iterator[int], stop: int) -> Iterator[int]:
+        """Yield the view of each step before the planned step `stop`."""
+        while self.position < stop:
+            yield next(order)
+            self.position += self._stride
+            self.count += 1
+            if self._limit is not None and self.count % _CHECKED == 0:
+                dr.sync_thread()
+                moment = time.perf_counter()
+                seconds = (moment - self._checked) / _CHECKED
+                self._checked = moment
+                late = self._steps - max(self.position, LAST_ROUND * self._steps)
+                early = max(LAST_ROUND * self._steps - self.position, 0)
+                if early:
+                    late *= _LATE
+                left = max(self._begin + self._limit - moment, 1e-3)
+                most = self._steps / _LEAST_STEPS
+                self._stride = float(np.clip((early + late) * seconds / left, 1, max(most, 1)))
+
+
 @dataclass(frozen=True, eq=False)
 class FirstFrame:
     """Result of fitting the first frame."""
@@ -125,6 +167,7 @@ def fit_first_frame(
     rng: np.random.Generator,
     progress: Progress | None = None,
     on_round: Callable[[Gaussians], None] | None = None,
+    limit: float | None = None,
 ) -> FirstFrame:
     """Return Gaussians fitted to the images of one timestamp by L_recon (eq. 2); their confidence
     stays unchanged.
@@ -139,6 +182,7 @@ def fit_first_frame(
         rng: draws the views and the means of births.
         progress: called with the numbers of steps made and of all steps.
         on_round: called with the Gaussians before each round of density control.
+        limit: of the time, seconds, for which steps are skipped; None: none.
     """
     steps = config.planned_steps
     start = problem.start
@@ -162,6 +206,12 @@ def fit_first_frame(
     control = DensityControl(problem.cameras, config.density, problem.extent, rng)
     losses = {}
     order = iter(view_order(len(views), steps, rng))
+    pace = _Pace(steps, limit)
+
+    def on_step(_: int) -> None:
+        if progress is not None:
+            progress(min(pace.position + 1, steps), steps)
+
     for first, stop in pairwise(sorted({0, *bands, *rounds, steps})):
         if on_round is not None and first in rounds:
             on_round(start.with_parameters(values_of(optimizer)))
@@ -178,14 +228,13 @@ def fit_first_frame(
             births = -(-missing // (len(rounds) - rounds.index(first)))
             start = start.select(control.step(optimizer, births).parent)
         chunk = Steps(
-            islice(order, stop - first),
-            first,
-            rate_factor=lambda step: _FINAL_RATE ** (step / steps),
-            on_step=None if progress is None else lambda count: progress(count, steps),
+            pace.views(order, stop),
+            rate_factor=lambda _: _FINAL_RATE ** (pace.position / steps),
+            on_step=on_step,
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )
         losses = optimise(optimizer, rates, losses_at, chunk)
-    return FirstFrame(start.with_parameters(values_of(optimizer)), losses, steps)
+    return FirstFrame(start.with_parameters(values_of(optimizer)), losses, pace.count)
 
 
 def density_rounds(config: FitConfig) -> list[int]:

@@ -148,9 +148,10 @@ class FitConfig:
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see
     `budget`).
     """
-    first_frame_seconds: Positive = 120.0
-    """Time that the first frame may take on two cores of a server: it limits those numbers of
-    Gaussians and of steps that are not given."""
+    first_frame_seconds: Positive | None = None
+    """Time that the first frame may take, with the exposures: a limit of this machine's clock, for
+    which steps are skipped. It also limits those numbers of Gaussians and of steps that are not
+    given. None: they take 120 s on two cores of a server, and are the same on every machine."""
     dropout: Annotated[float, Ge(0), Lt(1)] | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropped`);
     None: from the noise of the images and the angles between the views."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -97,6 +98,7 @@ def fitted_first_frame(
         progress: of the stages.
         on_provisional: called with provisional keyframes during the fit; None: there are none.
     """
+    begin = time.perf_counter()
     config = setup.config
     exposures, exposure_entry = _balanced(setup, observed.encoded, progress)
     views = views_of(setup, corrected(observed.encoded, exposures))
@@ -123,7 +125,12 @@ def fitted_first_frame(
         quality = {"sentence": expected.sentence, "quality": expected.quality}
         validation = {**quality, **asdict(expected), **exposure_entry}
     stage = "First frame" + ("" if seconds is None else f", about {max(seconds, 1):.0f} s")
-    fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round)
+    limit = config.fit.first_frame_seconds
+    if seconds is None:  # both numbers are given
+        limit = None
+    elif limit is not None:
+        limit = max(limit - (time.perf_counter() - begin), 1.0)
+    fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round, limit)
     packet = packet_of(fitted.gaussians)
     report = FrameReport(
         frame=0,

@@ -23,11 +23,11 @@ NO_GROWTH = DensityConfig(rounds=0)
 CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=NO_GROWTH)
 
 
-def fit(images, start, config, seed=0, progress=None, **changes):
+def fit(images, start, config, seed=0, progress=None, limit=None, **changes):
     """Fit some or all of the views; `changes` are masks and the cut-offs of the renderer."""
-    return fit_first_frame(
-        problem(images, start, **changes), config, np.random.default_rng(seed), progress
-    )
+    some = problem(images, start, **changes)
+    rng = np.random.default_rng(seed)
+    return fit_first_frame(some, config, rng, progress, limit=limit)
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +87,19 @@ def test_fit_first_frame__reports_its_steps(images):
         == 8
     )
     assert done == [("First frame", step, 8) for step in range(1, 9)]
+
+
+def test_fit_first_frame__skips_steps_to_keep_a_limit_of_the_clock(images, monkeypatch):
+    moments = iter(np.arange(0, 1e6, 2.0))  # 20 steps take 2 s
+    monkeypatch.setattr("morgs_mi.fit.first_frame.time.perf_counter", lambda: next(moments))
+    config = dataclasses.replace(CONFIG, first_frame_steps=2000)
+    done = []
+    report = Progress(lambda stage, step, total: done.append(step))
+    result = fit(images, ball(80), config, progress=report, limit=60.0)
+    assert next(moments) < 1.3 * 60
+    assert 200 < result.steps < 700
+    assert done == sorted(done)
+    assert done[-1] > 1990
 
 
 def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
