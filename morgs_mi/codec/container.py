@@ -43,6 +43,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, numbers
+from morgs_mi.core.types import Arrays
 
 _MAX_BYTES = 2**22
 _MAX_LEVELS = 32  # of JSON; recursive programs must be able to visit it
@@ -211,7 +212,7 @@ class Packet:
     frame: int  #: Index of the video frame.
     #: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are
     #: passed.
-    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    arrays: Arrays = field(default_factory=dict)
     place: str = ""  #: Description of where the packet was read, for messages; empty for a new one.
 
     def __post_init__(self) -> None:

@@ -48,6 +48,7 @@ from morgs_mi.codec.quantisation import (
 )
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.types import Arrays
 
 # Flags of the geometry of a Gaussian that dies; the first three groups are the bits below, all
 # others those above.
@@ -278,9 +279,7 @@ def residual_packet(
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
 
-def _sized_codes(
-    coder: Coder, birth_grid: Grid, config: CodecConfig
-) -> tuple[int, dict[str, np.ndarray]]:
+def _sized_codes(coder: Coder, birth_grid: Grid, config: CodecConfig) -> tuple[int, Arrays]:
     """Return the quantizer step of the changes, with which they fit into the `target_size` if there
     is one, and their words.
     """
@@ -438,7 +437,7 @@ def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
     return writer.words()
 
 
-def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid) -> dict[str, np.ndarray]:
+def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid) -> Arrays:
     """Return the words of the changes with a quantizer step, and of the births."""
     r = coder.rounded(quantizer_step)
     births = len(birth_grid)

@@ -37,6 +37,7 @@ from morgs_mi.core.attributes import ATTRIBUTES, SIGMOID, Attribute
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.types import Arrays
 
 _STORED: dict[str, Attribute] = {row.name: row for row in ATTRIBUTES if row.error is not None}
 _ERRORS = {row.name: row.error for row in ATTRIBUTES if row.error is not None}  # tolerated
@@ -215,7 +216,7 @@ def bounded(values: np.ndarray, low: int, high: int) -> np.ndarray:
     return values
 
 
-def groups_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
+def groups_of(gaussians: Gaussians) -> Arrays:
     """Return the raw attributes [N, ...] of Gaussians by group: the spherical harmonics in two
     parts.
     """
@@ -225,7 +226,7 @@ def groups_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return {name: fields[name] for name in GROUPS if name in fields}
 
 
-def check_finite(groups: Mapping[str, np.ndarray]) -> None:
+def check_finite(groups: Arrays) -> None:
     """Raise a ValueError if a raw attribute is not finite."""
     for name, value in groups.items():
         if not np.isfinite(value).all():
@@ -236,7 +237,7 @@ def check_finite(groups: Mapping[str, np.ndarray]) -> None:
             )
 
 
-def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
+def new_grid(raw: Arrays, cameras: Sequence[Camera], config: CodecConfig) -> Grid:
     """Return new Gaussians, given by their raw attributes by group, rounded to steps that are
     chosen here.
     """
@@ -252,7 +253,7 @@ def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: C
     return replace(grid, values=np.ascontiguousarray(values.T))
 
 
-def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
+def real_values(raw: Arrays, grid: Grid) -> np.ndarray:
     """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the
     steps of `grid`.
     """
@@ -285,9 +286,7 @@ def _quat_ratios(quats: np.ndarray, largest_components: np.ndarray) -> np.ndarra
     return np.clip(ratios, -_MAX_RATIO, _MAX_RATIO)
 
 
-def _exponents(
-    raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig
-) -> np.ndarray:
+def _exponents(raw: Arrays, cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
     """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config`
     tolerates.
     """

@@ -24,7 +24,7 @@ from morgs_mi.core.attributes import (
 )
 from morgs_mi.core.checks import numbers, require
 from morgs_mi.core.memory import float_tensor
-from morgs_mi.core.types import Float, Tensor, Tensors, UInt32
+from morgs_mi.core.types import Arrays, Float, Tensor, Tensors, UInt32
 
 
 class ActivatedGaussians(Protocol):
@@ -298,7 +298,7 @@ class Gaussians:
             f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
         }
 
-    def numpy(self) -> dict[str, np.ndarray]:
+    def numpy(self) -> Arrays:
         """Return copies of the raw attributes that are present, as NumPy arrays."""
         return {name: np.array(dr.detach(value)) for name, value in self.items().items()}
 

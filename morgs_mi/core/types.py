@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
+import numpy as np
+
 Float: TypeAlias = Any
 """`mi.Float`, a differentiable float32 array [N]."""
 Int32: TypeAlias = Any
@@ -23,3 +25,5 @@ Jit: TypeAlias = Any
 """Any Dr.Jit array, or nested vectors, tuples and lists of them."""
 Tensors: TypeAlias = Mapping[str, Tensor]
 """Tensors by name, such as parameters, losses or channels."""
+Arrays: TypeAlias = Mapping[str, np.ndarray]
+"""NumPy arrays by name."""

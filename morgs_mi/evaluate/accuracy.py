@@ -31,6 +31,7 @@ from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.plots import check_plot, save_plot
 from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.types import Arrays
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
@@ -46,7 +47,7 @@ def reference64(
     pixels: np.ndarray,
     weights: np.ndarray,
     config: RenderConfig,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+) -> tuple[np.ndarray, Arrays]:
     """Return the colours [P, 3] of some pixels over black (eq. 1), display-referred, and the
     gradients of the sum of `weights` times these colours, by attribute in its shape.
 

@@ -15,6 +15,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, exposed
+from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.metrics import recorded_change
 from morgs_mi.playback.player import has_confidence, render
 from morgs_mi.playback.stream_header import open_stream_capture, render_config, truth_for_camera
@@ -113,7 +114,7 @@ class ComparedView:
 
     frame: ComparedFrame  #: Its frame.
     index: int  #: Of the view.
-    maps: Mapping[str, np.ndarray]  #: Rendered channels by name.
+    maps: Arrays  #: Rendered channels by name.
     recorded: np.ndarray  #: image [H, W, 3], uint8; of an HDR recording as a display shows it.
     valid: np.ndarray | None  #: Valid pixels [H, W] bool; None: all.
     moving: np.ndarray | None  #: Moving pixels [H, W] bool; None: unknown.

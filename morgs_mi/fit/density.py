@@ -29,6 +29,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import scene_extent
+from morgs_mi.core.types import Arrays
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.initialise import in_empty_space
 from morgs_mi.fit.optimise import select_rows, values_of
@@ -64,7 +65,7 @@ class DensityPlan:
     parent: np.ndarray  #: int [M], index among the N Gaussians before.
     source: np.ndarray  #: int [M], the same for survivors, -1 for births.
     #: Changes added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
-    edits: dict[str, np.ndarray] = field(default_factory=dict)
+    edits: Arrays = field(default_factory=dict)
 
 
 def plan_growth(

@@ -13,7 +13,7 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians, at_rest, displaced
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
-from morgs_mi.core.types import Tensors
+from morgs_mi.core.types import Arrays, Tensors
 from morgs_mi.fit.density import DensityControl, apply_plan
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
@@ -50,7 +50,7 @@ class FrameProblem:
     active: ActiveSet  #: The active Gaussians and views.
     targets: Mapping[int, Target]  #: Images of the active views, by view index.
     #: Observations of the key views: arrays [H, W, ...] by name, by view index.
-    observations: Mapping[int, Mapping[str, np.ndarray]]
+    observations: Mapping[int, Arrays]
     #: Start of the motion, confidence, colour and rotation of the A active Gaussians; None: no
     #: motion, and all else as before.
     start: MotionStart | None

@@ -12,7 +12,7 @@ import numpy as np
 from drjit.opt import Adam
 
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Tensor, Tensors
+from morgs_mi.core.types import Arrays, Tensor, Tensors
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.render.kernel_recording import render_lock
 
@@ -60,7 +60,7 @@ def select_rows(
     optimizer: Adam,
     rows: np.ndarray,
     is_birth: np.ndarray,
-    edits: Mapping[str, np.ndarray] | None = None,
+    edits: Arrays | None = None,
 ) -> None:
     """Replace the parameters [N, ...] and their moments by rows of them [M, ...]; moments of births
     are 0.

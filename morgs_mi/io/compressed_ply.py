@@ -32,6 +32,7 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
+from morgs_mi.core.types import Arrays
 from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
 
 _CHUNK = 256
@@ -84,7 +85,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         PlyData(elements, byte_order="<").write(str(partial))
 
 
-def _chunks(raw: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _chunks(raw: Arrays) -> tuple[np.ndarray, Arrays]:
     """Return the rows of the chunks, and the values [N, 3] as fractions between their bounds."""
     values = {
         "position": raw["means"],
@@ -128,7 +129,7 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
         **dict.fromkeys([name for names in bounds for name in names], "f4"),
         **dict.fromkeys(rest_names(K), "u1"),
     }
-    stored_types = {name: v.dtype.str[1:] for name, v in (chunks | vertices | rest).items()}
+    stored_types = {name: v.dtype.str[1:] for name, v in {**chunks, **vertices, **rest}.items()}
     N, num_chunks, num_sh = (len(next(iter(e.values()), ())) for e in (vertices, chunks, rest))
     faults = [
         f"no {name} of type {kind}"
@@ -164,7 +165,7 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
         return Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
 
 
-def _between(chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray) -> np.ndarray:
+def _between(chunks: Arrays, key: str, fractions: np.ndarray) -> np.ndarray:
     """Return the values [N, 3] at fractions between the bounds of their chunks."""
     low, high = (
         _by_row(np.stack([chunks[name] for name in names], axis=1), len(fractions))

@@ -17,6 +17,7 @@ import OpenEXR
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.files import atomic_path
+from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
 
 # Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
@@ -32,7 +33,7 @@ _CHANNEL = re.compile(rb"([^\0]+)\0.{8}(.{8})", re.DOTALL)
 _DEEP = re.compile(rb"type\0string\0.{4}deep", re.DOTALL)
 
 
-def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
+def write_exr(path: str | Path, channels: Arrays) -> None:
     """Write `channels`, each [H, W], as one float32 EXR file, atomically.
 
     Raises:
@@ -54,7 +55,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
             raise OSError(str(error)) from error
 
 
-def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+def read_exr(path: str | Path) -> Arrays:
     """Return the channels of an EXR file by name, each [H, W] as float32: its display window, with
     0 where no pixel is stored.
 
@@ -111,7 +112,7 @@ def opaque_light(path: str | Path) -> np.ndarray:
     return channels.get(f"{_color_names(path, channels)[0][:-1]}A", stored) > 1 - _SAME
 
 
-def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> list[str]:
+def _color_names(path: str | Path, channels: Arrays) -> list[str]:
     """Return the names of the channels of red, green and blue."""
     layers = {
         name[:-1]
@@ -127,7 +128,7 @@ def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> list[s
     )
 
 
-def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _read(path: str | Path) -> tuple[Arrays, dict[str, Any]]:
     """Return the channels of an EXR file by name, and its header."""
     existing_file(path, "an EXR file")
     try:

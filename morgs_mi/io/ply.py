@@ -30,6 +30,7 @@ from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
+from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply_kinds import as_3dgs
 
@@ -163,7 +164,7 @@ def read_ply(path: str | Path) -> Gaussians:
     )
 
 
-def _table(vertices: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+def _table(vertices: Arrays, names: Sequence[str]) -> np.ndarray:
     """Return properties as a table [N, names], float32, within their bounds."""
     values = np.empty((len(vertices["x"]), len(names)), np.float32)
     with np.errstate(over="ignore"):  # infinite, and therefore invalid
@@ -172,7 +173,7 @@ def _table(vertices: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
     return values
 
 
-def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
+def read_vertices(path: str | Path) -> Arrays:
     """Return the properties of the vertices in a PLY file, binary or text, by name, each [N] in its
     stored type.
 
@@ -185,7 +186,7 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
 
 def read_elements(
     path: str | Path, required: Sequence[str], optional: Sequence[str] = ()
-) -> dict[str, dict[str, np.ndarray]]:
+) -> dict[str, Arrays]:
     """Return the properties of elements of a PLY file, by the names of element and property, each
     [rows].
 
@@ -252,11 +253,11 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
 
 def _read_properties(
     file: BinaryIO, order: str, elements: Sequence[_Element], names: set[str]
-) -> dict[str, dict[str, np.ndarray]]:
+) -> dict[str, Arrays]:
     """Return the properties of the elements in `names`; those after the last of these are not
     read.
     """
-    properties: dict[str, dict[str, np.ndarray]] = {}
+    properties: dict[str, Arrays] = {}
     for element in elements:
         if properties.keys() == names:
             break

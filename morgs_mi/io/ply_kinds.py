@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.core.checks import few
+from morgs_mi.core.types import Arrays
 
 _log = logging.getLogger(__name__)
 
-Vertices = dict[str, np.ndarray]
 
 # Timestamps and durations; all of a file's Gaussians may be of one timestamp.
 _TIME = re.compile(
@@ -63,7 +63,7 @@ _GAUSSIAN = {"f_dc_0", "opacity", "scale_0", "rot_0"}
 _named: set[tuple[Path, str]] = set()
 
 
-def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
+def as_3dgs(path: str | Path, vertices: Arrays) -> Arrays:
     """Return the properties of Gaussians of any kind as 3D Gaussian Splatting has them.
 
     Args:
@@ -105,7 +105,7 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     return {**vertices, "scale_2": np.full(len(vertices["scale_0"]), -np.inf, np.float32)}
 
 
-def _with_filter(vertices: Vertices) -> Vertices:
+def _with_filter(vertices: Arrays) -> Arrays:
     """Return Gaussians with their 3D smoothing filter in sizes and opacities (Mip-Splatting, Yu et
     al. 2024, eq. 9).
     """
@@ -121,6 +121,5 @@ def _with_filter(vertices: Vertices) -> Vertices:
         opacity = ratio / (1 + np.exp(-vertices["opacity"].astype(np.float64)))
         columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
     unfiltered = squares == 0
-    return vertices | {
-        name: np.where(unfiltered, vertices[name], values) for name, values in columns.items()
-    }
+    values = {name: np.where(unfiltered, vertices[name], v) for name, v in columns.items()}
+    return {**vertices, **values}

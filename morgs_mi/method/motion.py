@@ -49,6 +49,7 @@ import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.core.types import Arrays
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
 from morgs_mi.method.flow import FlowObservation
@@ -111,9 +112,7 @@ def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return color.sum(0) / (weight.sum(0)[:, None] + _HALF_COLOR_PIXELS) / np.float32(SH_C0)
 
 
-def _step(
-    jacobians: np.ndarray, sums: Mapping[str, np.ndarray], near: np.ndarray, moves: np.ndarray
-) -> np.ndarray:
+def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums G [V, N, 3] (xx, xy, yy) and b
     [V, N, 2], shortened to `LONGEST_PX` in the view where it is longest.
     """

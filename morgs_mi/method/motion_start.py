@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.core.types import Arrays
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.flow import FlowObservation
@@ -62,7 +63,7 @@ class MotionProblem:
         """The images of all views, at least one."""
         return KeyImages(self.views, self.targets)
 
-    def sums_at(self, displacement: np.ndarray) -> dict[str, np.ndarray]:
+    def sums_at(self, displacement: np.ndarray) -> Arrays:
         """Return the sums of all maps of a sweep, with the Gaussians displaced by d [N, 3]; kept
         until d is another.
         """

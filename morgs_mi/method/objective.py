@@ -25,13 +25,12 @@ from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 from annotated_types import Ge, Le
 
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.config import NonNegative, config_class
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.types import Tensor, Tensors
+from morgs_mi.core.types import Arrays, Tensor, Tensors
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.method_registry import Registry
@@ -164,7 +163,7 @@ class Prediction:
 
 
 Loss = Callable[[Prediction, Observations, ObjectiveConfig], Tensor]
-Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Mapping[str, np.ndarray]]
+Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Arrays]
 
 
 @dataclass(frozen=True)
@@ -297,7 +296,7 @@ def terms_of(config: ObjectiveConfig) -> tuple[Term, ...]:
 
 def observe(
     views: Mapping[int, KeyView], motion: MotionConfig, config: ObjectiveConfig
-) -> dict[int, dict[str, np.ndarray]]:
+) -> dict[int, Arrays]:
     """Return the observations of the key views, arrays [H, W, ...] by name, by view index."""
     observers = [term.observer for term in terms_of(config) if term.observer]
     return {

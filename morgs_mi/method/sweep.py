@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.types import Float
+from morgs_mi.core.types import Arrays, Float
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView, Drawing, ViewGroup
 from morgs_mi.render.backend import elements
@@ -46,7 +46,7 @@ _FLOOR_PX = 0.01
 _FLOOR_WEIGHT = 1.0
 
 
-def relative_error(sums: Mapping[str, np.ndarray]) -> np.ndarray:
+def relative_error(sums: Arrays) -> np.ndarray:
     """Return the mean error of each Gaussian's pixels [N], of 1, from the sums of ``error`` and
     ``weight`` [V, N].
     """
@@ -66,7 +66,7 @@ class KeyImages:
         self._targets = [targets[v] for v in views]
         self.group = ViewGroup([*views.values()])
 
-    def sums(self, gaussians: Gaussians, names: Sequence[str]) -> dict[str, np.ndarray]:
+    def sums(self, gaussians: Gaussians, names: Sequence[str]) -> Arrays:
         """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one
         number has no axis.
 

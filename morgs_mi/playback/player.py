@@ -19,6 +19,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.png import png_bytes
+from morgs_mi.core.types import Arrays
 from morgs_mi.playback.stream_header import metadata_entry, render_config, stream_exposure
 from morgs_mi.playback.visualise import (
     confidence_image,
@@ -41,7 +42,7 @@ _MOST_TIMED_FRAMES = 30
 
 def render_stream(
     stream: FrameSource, camera: Camera, channels: Sequence[str] | None = None
-) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+) -> Iterator[tuple[int, Arrays]]:
     """Render every frame of a stream for one camera, with the cut-offs of the fit.
 
     Args:
@@ -141,7 +142,7 @@ def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
 
 def render(
     gaussians: Gaussians, camera: Camera, channels: Sequence[str], config: RenderConfig
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Return rendered channels as float32 arrays [H, W, C] by name."""
     image = rasterize(gaussians, camera, channels, config=config)
     return {name: np.array(image[name]) for name in channels}

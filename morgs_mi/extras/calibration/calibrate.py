@@ -42,6 +42,7 @@ from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.progress import Report
+from morgs_mi.core.types import Arrays
 from morgs_mi.extras.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck
 from morgs_mi.io.video import open_clips
@@ -293,9 +294,7 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     return CameraCheck(name, len(errors), error, not advice, advice)
 
 
-def _frames(
-    path: Path, config: CalibrateConfig, without: Sequence[str]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tuple[Arrays, Arrays]:
     """Return one image per camera by its name, and the masks of opaque pixels of images with
     transparent ones.
     """
@@ -332,8 +331,8 @@ def _frames(
 
 def match_views(
     path: Path,
-    images: dict[str, np.ndarray],
-    masks: dict[str, np.ndarray],
+    images: Arrays,
+    masks: Arrays,
     scratch: Path,
     config: CalibrateConfig,
     report: Report,

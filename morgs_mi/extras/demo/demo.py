@@ -18,6 +18,7 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import REPORT, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report, Steps
+from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import stored_settings, synthesize
@@ -204,9 +205,7 @@ def _draw(out: Path, capture: Capture, report: Steps) -> None:
     report(2, 2)
 
 
-def _panels(
-    capture: Capture, stream: Path, scale: float, note: str = ""
-) -> list[dict[str, np.ndarray]]:
+def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> list[Arrays]:
     """Return the labelled images of every frame of the held-out view by name; `note` is appended to
     the labels.
     """

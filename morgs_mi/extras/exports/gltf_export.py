@@ -32,6 +32,7 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
 from morgs_mi.core.rig import up_direction
+from morgs_mi.core.types import Arrays
 
 _NAME = "KHR_gaussian_splatting"
 _FLOAT = 5126
@@ -126,7 +127,7 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     return head + b"".join(chunks)
 
 
-def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
+def _attributes(gaussians: Gaussians) -> Arrays:
     raw = gaussians.numpy()
     opacities = np.asarray(gaussians.opacities, np.float32)
     alpha = np.clip(opacities, 0, 1)[:, None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from morgs_mi.core.checks import kind_of, require
 from morgs_mi.core.color_space import unit_values
+from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
 
 # Mean and standard deviation of ImageNet's colours, by which most networks for images normalise
@@ -84,7 +85,7 @@ class OnnxNetwork:
         is_small = max(counts, default=0) <= _MAX_VALUES
         require(is_small, str(path), requirement, got, "export it for smaller images")
 
-    def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def run(self, inputs: Arrays) -> Arrays:
         """Return all outputs by name, in their order.
 
         Args:

@@ -17,7 +17,6 @@ its box. The package contains no weights; docs/masks.md explains how to export t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -25,6 +24,7 @@ import numpy as np
 
 from morgs_mi.core.checks import require
 from morgs_mi.core.documentation import page
+from morgs_mi.core.types import Arrays
 from morgs_mi.extras.networks.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig, MaskRefiner
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask
@@ -107,7 +107,7 @@ class SegmentNetwork:
             objects |= self._segment(features, labels == label)
         return objects
 
-    def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
+    def _segment(self, features: Arrays, component: np.ndarray) -> np.ndarray:
         """Return the object [H, W] under one component: the decoder's mask with the highest
         predicted IoU.
         """

@@ -16,6 +16,7 @@ from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
 from morgs_mi.core.rig import moved
+from morgs_mi.core.types import Arrays
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.default_rig import DEFAULT_RIG
@@ -176,7 +177,7 @@ def flight(
     path: CameraPath,
     channels: Sequence[str] | None = ("color",),
     clip: Iterator[Gaussians] | None = None,
-) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+) -> Iterator[tuple[int, Arrays]]:
     """Render a stream along a camera path, at the stream's frame rate.
 
     Args:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from morgs_mi.core.color_space import decode_light, exposed
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.png import png_bytes
+from morgs_mi.core.types import Arrays
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
@@ -17,11 +18,11 @@ from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.visualise import side_by_side, to_uint8, write_png
 
 # Index and channels [H, W, C] by name.
-_Frame = tuple[int, Mapping[str, np.ndarray]]
+_Frame = tuple[int, Arrays]
 
 
 def write_images(
-    rendered: Iterable[tuple[int, Mapping[str, np.ndarray]]],
+    rendered: Iterable[tuple[int, Arrays]],
     fps: float,
     output: str | Path,
     progress: Callable[[int], None] | None = None,
@@ -86,7 +87,7 @@ def _display_frames(
             progress(count)
 
 
-def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def exr_channels(images: Arrays) -> Arrays:
     """Return rendered images [H, W, C] as EXR channels [H, W] under the names of the renderer's
     AOVs.
 
@@ -121,5 +122,5 @@ def pad_to_even(image: np.ndarray) -> np.ndarray:
     return np.pad(image, ((0, H % 2), (0, W % 2), (0, 0)), mode="edge")
 
 
-def _combined_image(images: Mapping[str, np.ndarray]) -> np.ndarray:
+def _combined_image(images: Arrays) -> np.ndarray:
     return side_by_side([channel_image(name, image) for name, image in images.items()])
