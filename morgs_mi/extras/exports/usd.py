@@ -47,6 +47,7 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.core.progress import Steps
+from morgs_mi.core.types import Arrays
 from morgs_mi.extras.exports.gltf_export import gltf_axes
 from morgs_mi.playback.export.formats import USD, choose_format
 from morgs_mi.playback.stream_header import stream_origin
@@ -125,8 +126,43 @@ def _write_stage(
     axes = gltf_axes(stream.cameras)
     sets = _sets(_states(stream, frames), axes)
     stage = pxr.Usd.Stage.CreateNew(str(path))
-    _describe(pxr, stage, stream, frames, axes)
-    fields = _fields(pxr, stage, sets, frames, half)
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(stream.fps)
+    stage.SetFramesPerSecond(stream.fps)
+    stage.SetStartTimeCode(frames[0])
+    stage.SetEndTimeCode(frames[-1])
+    xform = pxr.UsdGeom.Xform.Define(stage, "/Stream")
+    if (origin := stream_origin(stream)).any():
+        xform.AddTranslateOp().Set(pxr.Gf.Vec3d(*(axes @ origin)))
+    root = xform.GetPrim()
+    pxr.Usd.ModelAPI(root).SetKind(pxr.Kind.Tokens.component)
+    # Rotation back to the capture's axes, of row vectors: x_world = x_usd M.
+    root.SetCustomDataByKey("world_from_usd", pxr.Gf.Matrix3d(np.asarray(axes, np.float64)))
+    stage.SetDefaultPrim(root)
+    # A prim for each set, with what does not change.
+    fields = {}
+    ends = [*(gaussians.start for gaussians in sets.values()), None][1:]
+    for number, ((first_id, gaussians), end) in enumerate(zip(sets.items(), ends, strict=True)):
+        prim_path = f"/Stream/Gaussians{number or ''}"
+        splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, prim_path)
+        prim = splats.GetPrim()
+        prim.GetAttribute(_DEGREE).Set(gaussians.degree)
+        splats.CreateProjectionModeHintAttr("perspective")
+        splats.CreateSortingModeHintAttr("zDepth")
+        # As far as the schema goes: it does not state the space of the coefficients.
+        prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
+            pxr.Gf.ColorSpaceNames.SRGBRec709
+        )
+        # The prim is visible until the next set starts.
+        visibility = splats.CreateVisibilityAttr
+        if gaussians.start > frames[0]:
+            visibility().Set("invisible", frames[0])
+            visibility().Set("inherited", gaussians.start)
+        if end is not None:
+            visibility().Set("inherited", gaussians.start)
+            visibility().Set("invisible", end)
+        fields[first_id] = _Field(pxr, prim, gaussians, half)
     unsaved_bytes = 0
     for count, state in enumerate(_states(stream, frames), start=1):
         unsaved_bytes += fields[state.first_id].put(state, axes)
@@ -152,12 +188,12 @@ class _Set:
     start: int  # the first frame
     degree: int  # of the spherical harmonics
     ids: np.ndarray  # uint32 [M], ascending
-    births: dict[str, np.ndarray]  # attributes [M, ...] at birth, by the names of the schema
+    births: Arrays  # attributes [M, ...] at birth, by the names of the schema
 
 
 def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
     """Return the sets of Gaussians by the number that is added to their ids."""
-    parts_of: dict[int, list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
+    parts_of: dict[int, list[tuple[np.ndarray, Arrays]]] = {}
     starts: dict[int, tuple[int, int]] = {}
     for state in states:
         parts = parts_of.setdefault(state.first_id, [])
@@ -177,7 +213,7 @@ def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
     return sets
 
 
-def _values(gaussians: Gaussians) -> dict[str, np.ndarray]:
+def _values(gaussians: Gaussians) -> Arrays:
     """Return the attributes float32 [N, ...] by the names of the schema; quaternions are xyzw, as
     in memory.
     """
@@ -258,55 +294,6 @@ def _extent(gaussians: Gaussians) -> np.ndarray:
     means = gaussians.numpy()["means"]
     reach = _EXTENT_SIGMAS * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
     return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]).astype(np.float32)
-
-
-def _describe(
-    pxr: Any, stage: Any, stream: FrameSource, frames: Sequence[int], axes: np.ndarray
-) -> None:
-    """Write the metadata of the stage and its root prim."""
-    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
-    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(stream.fps)
-    stage.SetFramesPerSecond(stream.fps)
-    stage.SetStartTimeCode(frames[0])
-    stage.SetEndTimeCode(frames[-1])
-    xform = pxr.UsdGeom.Xform.Define(stage, "/Stream")
-    if (origin := stream_origin(stream)).any():
-        xform.AddTranslateOp().Set(pxr.Gf.Vec3d(*(axes @ origin)))
-    root = xform.GetPrim()
-    pxr.Usd.ModelAPI(root).SetKind(pxr.Kind.Tokens.component)
-    # Rotation back to the capture's axes, of row vectors: x_world = x_usd M.
-    root.SetCustomDataByKey("world_from_usd", pxr.Gf.Matrix3d(np.asarray(axes, np.float64)))
-    stage.SetDefaultPrim(root)
-
-
-def _fields(
-    pxr: Any, stage: Any, sets: dict[int, _Set], frames: Sequence[int], half: bool
-) -> dict[int, _Field]:
-    """Define a prim for each set, with what does not change, and return their writers."""
-    fields = {}
-    ends = [*(gaussians.start for gaussians in sets.values()), None][1:]
-    for number, ((first_id, gaussians), end) in enumerate(zip(sets.items(), ends, strict=True)):
-        path = f"/Stream/Gaussians{number or ''}"
-        splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
-        prim = splats.GetPrim()
-        prim.GetAttribute(_DEGREE).Set(gaussians.degree)
-        splats.CreateProjectionModeHintAttr("perspective")
-        splats.CreateSortingModeHintAttr("zDepth")
-        # As far as the schema goes: it does not state the space of the coefficients.
-        prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
-            pxr.Gf.ColorSpaceNames.SRGBRec709
-        )
-        # The prim is visible until the next set starts.
-        visibility = splats.CreateVisibilityAttr
-        if gaussians.start > frames[0]:
-            visibility().Set("invisible", frames[0])
-            visibility().Set("inherited", gaussians.start)
-        if end is not None:
-            visibility().Set("inherited", gaussians.start)
-            visibility().Set("invisible", end)
-        fields[first_id] = _Field(pxr, prim, gaussians, half)
-    return fields
 
 
 def _pxr() -> Any:

@@ -41,7 +41,7 @@ from morgs_mi.core.config import Count, check_ranges
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Float, UInt32
+from morgs_mi.core.types import Arrays, Float, UInt32
 from morgs_mi.extras.light.light_probe import CLIPPED, check_point, light_probe
 from morgs_mi.extras.synth.scene import build_of, failures_in
 from morgs_mi.gaussian_integrator import ellipsoids
@@ -152,7 +152,7 @@ def render_inserted(
     frames: Sequence[int] | None = None,
     channels: Sequence[str] = ("color",),
     config: InsertConfig | None = None,
-) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+) -> Iterator[tuple[int, Arrays]]:
     """Render frames of a stream for one camera with a Mitsuba scene inserted.
 
     An inserted scene without emitters is lit by the Gaussians. A capture rarely shows what is
@@ -189,11 +189,6 @@ def render_inserted(
             yield frame, images
 
 
-def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[float]:
-    image = np.asarray(rasterize(gaussians, camera, ("color",)).color)
-    return np.clip(image, 0, np.inf if clipped == 1 else 1.0).mean((0, 1)).tolist()
-
-
 def _render(
     gaussians: Gaussians,
     camera: Camera,
@@ -221,7 +216,24 @@ def _render(
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit_scene, camera.position)
         dark = shadowed(gaussians, ratio)
-        images = _plugin_images(dark, camera, surfaces, nested, channels, config.samples)
+        aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
+        integrator = {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)}
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "gaussians": ellipsoids(dark),
+                "sensor": _sensor(camera),
+                "integrator": integrator,
+                **{f"part{i}": part for i, part in enumerate(_parts(surfaces))},
+            }
+        )
+        image = np.asarray(scene.integrator().render(scene, spp=config.samples))
+        images = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}
+        first = 4
+        for name in aovs:
+            size = len(exr_names(name))
+            images[name] = image[..., first : first + size]
+            first += size
         if "surfaces" in channels:
             sensor = _sensor(camera)
             with traced(nested, rays_for(nested, dark), srgb=True):
@@ -257,7 +269,8 @@ def _lit_scenes(
     )
     if scene.emitters():
         return scene, scene
-    color = _mean_color(gaussians, camera, clipped)
+    image = np.asarray(rasterize(gaussians, camera, ("color",)).color)
+    color = np.clip(image, 0, np.inf if clipped == 1 else 1.0).mean((0, 1)).tolist()
     center = np.array(box.center()).ravel()
     lamp = light_probe(gaussians, center, background=color, clipped=clipped)
     lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
@@ -267,36 +280,6 @@ def _lit_scenes(
     radiance = decode_light(np.array(color)).tolist()
     lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp}), lit_scene
-
-
-def _plugin_images(
-    gaussians: Gaussians,
-    camera: Camera,
-    surfaces: Any,
-    nested: Any,
-    channels: Sequence[str],
-    samples: int,
-) -> dict[str, np.ndarray]:
-    """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
-    aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
-    integrator = {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "gaussians": ellipsoids(gaussians),
-            "sensor": _sensor(camera),
-            "integrator": integrator,
-            **{f"part{i}": part for i, part in enumerate(_parts(surfaces))},
-        }
-    )
-    image = np.asarray(scene.integrator().render(scene, spp=samples))
-    images = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}
-    first = 4
-    for name in aovs:
-        size = len(exr_names(name))
-        images[name] = image[..., first : first + size]
-        first += size
-    return images
 
 
 def _sensor(camera: Camera) -> Any:
