@@ -270,19 +270,6 @@ def residual_packet(
     births = len(gaussians) - len(survivors)
     birth_groups = {name: value[len(survivors) :] for name, value in groups.items()}
     birth_grid = new_grid(birth_groups, cameras, config)
-    quantizer_step, codes = _sized_codes(coder, birth_grid, config)
-    arrays = {
-        "parent": previous.digest,
-        "head": np.array([births, quantizer_step], np.uint32),
-        **codes,
-    }
-    return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
-
-
-def _sized_codes(coder: Coder, birth_grid: Grid, config: CodecConfig) -> tuple[int, Arrays]:
-    """Return the quantizer step of the changes, with which they fit into the `target_size` if there
-    is one, and their words.
-    """
     target = config.target_size
     quantizer_step = round(4 * np.log2(config.birth_precision))
     if target:
@@ -302,7 +289,12 @@ def _sized_codes(coder: Coder, birth_grid: Grid, config: CodecConfig) -> tuple[i
     ):
         quantizer_step += 1
         codes = _codes(coder, quantizer_step, birth_grid)
-    return quantizer_step, codes
+    arrays = {
+        "parent": previous.digest,
+        "head": np.array([births, quantizer_step], np.uint32),
+        **codes,
+    }
+    return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
 
 def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:

@@ -258,8 +258,17 @@ def real_values(raw: Arrays, grid: Grid) -> np.ndarray:
     steps of `grid`.
     """
     N = len(grid.largest_components)
-    numbers = {**raw, "quats": _quat_ratios(raw["quats"], grid.largest_components)}
-    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
+    # The other components of the quaternions relative to the largest one. What was the largest at
+    # birth is zero after a turn by 180 degrees; the ratio is then very large.
+    quats = np.asarray(raw["quats"], np.float64)
+    is_largest = _is_largest(grid.largest_components)
+    largest = quats[is_largest][:, None]
+    ratios = quats[~is_largest].reshape(-1, 3) / np.where(np.abs(largest) < 1e-12, 1e-12, largest)
+    numbers = {
+        **raw,
+        "quats": np.clip(ratios, -_MAX_RATIO, _MAX_RATIO),
+        "logit_opacities": np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT),
+    }
     for name in optional_names(grid.optional):
         if _STORED[name].activation is SIGMOID:  # which saturates
             numbers[name] = np.clip(raw[name], -_MAX_OPTIONAL, _MAX_OPTIONAL)
@@ -270,20 +279,6 @@ def real_values(raw: Arrays, grid: Grid) -> np.ndarray:
         ]
     )
     return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
-
-
-def _quat_ratios(quats: np.ndarray, largest_components: np.ndarray) -> np.ndarray:
-    """Return the other components of quaternions [N, 4] relative to the largest one, float64
-    [N, 3].
-    """
-    quats = np.asarray(quats, np.float64)
-    is_largest = _is_largest(largest_components)
-    others = quats[~is_largest].reshape(-1, 3)
-    largest = quats[is_largest][:, None]
-    # The component that was the largest at birth is zero after a turn by 180 degrees; the ratio is
-    # then very large.
-    ratios = others / np.where(np.abs(largest) < 1e-12, 1e-12, largest)
-    return np.clip(ratios, -_MAX_RATIO, _MAX_RATIO)
 
 
 def _exponents(raw: Arrays, cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:

@@ -18,7 +18,6 @@ from morgs_mi.core.progress import Steps
 from morgs_mi.evaluate.comparison import ComparedClip
 from morgs_mi.evaluate.measures import (
     ImageDistance,
-    Measure,
     Motion3D,
     Quality,
     Speed,
@@ -62,8 +61,8 @@ def evaluate_stream(
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
     fitted = _fitted(stream.path)
-    measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
-    rows: list[FrameScores] = []
+    measures = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
+    rows = []
     for frame in clip.frames():
         for view in frame.views():
             for measure in measures:

@@ -146,9 +146,13 @@ class Motion3D(Measure):
         state = frame.state
         self._last_state = state
         tracks = self._tracks
-        if frame.kind != PacketKind.RESIDUAL or last_state is None:
-            return {"motion_3d": None}
-        if tracks is None or self._truth is None or state.frame >= tracks.points.shape[1]:
+        if (
+            frame.kind != PacketKind.RESIDUAL
+            or last_state is None
+            or tracks is None
+            or self._truth is None
+            or state.frame >= tracks.points.shape[1]
+        ):
             return {"motion_3d": None}
         views = []
         for camera in self._cameras:

@@ -195,14 +195,15 @@ def unit_pair(
 
 
 def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> None:
-    if np.shape(image) != np.shape(truth):
+    shape = np.shape(image)
+    if shape != np.shape(truth):
         raise ValueError(
-            f"{name}(): both images must have one size, got {np.shape(image)} and "
-            f"{np.shape(truth)}; resize one first."
+            f"{name}(): both images must have one size, got {shape} and {np.shape(truth)}; resize "
+            "one first."
         )
-    if mask is not None and (mask.shape != np.shape(image)[:2] or mask.dtype != bool):
+    if mask is not None and (mask.shape != shape[:2] or mask.dtype != bool):
         raise ValueError(
-            f"{name}(): `mask` must be bool {np.shape(image)[:2]}, got {mask.dtype} {mask.shape}."
+            f"{name}(): `mask` must be bool {shape[:2]}, got {mask.dtype} {mask.shape}."
         )
 
 

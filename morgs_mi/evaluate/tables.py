@@ -27,26 +27,32 @@ def figure(value: float | None, digits: int) -> str:
 
 def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     """Yield tables of the frames, of several views and of the regions."""
-    yield _frame_table(result)
-    if len(result.views) > 1:
-        yield _view_table(result)
-    yield _region_table(result)
-
-
-def _frame_table(result: Evaluation) -> Table:
-    """Return the scores, the size and the time of each frame."""
+    kind = "held-out" if result.held_out else "training"
+    names = ", ".join(result.views)
+    evaluated = f"{kind} views" if len(result.views) > 1 else f"{kind} view {names}"
     table = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result.frames:
         scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
         table.add_row(
             str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1)
         )
-    return table
-
-
-def _region_table(result: Evaluation) -> Table:
-    """Return the mean scores of the whole images and of their regions, without unknown rows."""
-    title = f"{_views(result)}: means, regions from {result.regions}"
+    yield table
+    if len(result.views) > 1:
+        rows = {
+            name: asdict(scores)
+            for name, scores in (*result.views.items(), ("mean", result.scores))
+        }
+        columns = [
+            (title, name, digits)
+            for title, name, digits in _VIEW
+            if any(figure(row[name], 0) != "-" for row in rows.values())
+        ]
+        title = f"{evaluated}, means over the frames"
+        table = _table(title, "", *(title for title, *_ in columns))
+        for name, row in rows.items():
+            table.add_row(name, *(figure(row[score], digits) for _, score, digits in columns))
+        yield table
+    title = f"{evaluated}: means, regions from {result.regions}"
     table = _table(title, "", "whole", "moving", "still")
     mean = result.scores
     for title, name, digits in _METRICS:
@@ -60,32 +66,7 @@ def _region_table(result: Evaluation) -> Table:
     if result.variation.render == result.variation.render:
         table.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         table.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
-    return table
-
-
-def _views(result: Evaluation) -> str:
-    """Return which views were evaluated, a single one by its name."""
-    kind = "held-out" if result.held_out else "training"
-    if len(result.views) > 1:
-        return f"{kind} views"
-    return f"{kind} view " + ", ".join(result.views)
-
-
-def _view_table(result: Evaluation) -> Table:
-    """Return the scores of each view, and their means, without columns that have none."""
-    rows = {
-        name: asdict(scores) for name, scores in (*result.views.items(), ("mean", result.scores))
-    }
-    columns = [
-        (title, name, digits)
-        for title, name, digits in _VIEW
-        if any(figure(row[name], 0) != "-" for row in rows.values())
-    ]
-    title = f"{_views(result)}, means over the frames"
-    table = _table(title, "", *(title for title, *_ in columns))
-    for name, row in rows.items():
-        table.add_row(name, *(figure(row[score], digits) for _, score, digits in columns))
-    return table
+    yield table
 
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:

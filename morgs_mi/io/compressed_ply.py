@@ -66,7 +66,24 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         OSError: the file cannot be written.
     """
     raw = gaussians.numpy()
-    chunks, fractions = _chunks(raw)
+    values = {
+        "position": raw["means"],
+        "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
+        "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
+    }
+    columns = [name for ends in _BOUNDS.values() for names in ends for name in names]
+    chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in columns])
+    fractions = {}  # of the values between the bounds of their chunks
+    for key, value in values.items():
+        value = value.astype(np.float32)
+        bounds = []
+        for names, bound in zip(_BOUNDS[key], (np.minimum, np.maximum), strict=True):
+            ends = bound.reduceat(value, np.arange(0, len(value), _CHUNK), axis=0)
+            for name, column in zip(names, ends.T, strict=True):
+                chunks[name] = column
+            bounds.append(_by_row(ends, len(value)))
+        low, high = bounds
+        fractions[key] = (value - low) / np.where(high > low, high - low, 1)
     opacities = expit(raw["logit_opacities"].astype(np.float64))[:, None]
     colors = np.concatenate([fractions["color"], opacities], axis=1)
     vertices = np.empty(len(colors), [(name, "<u4") for name in _PACKED])
@@ -83,29 +100,6 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         elements.append(PlyElement.describe(rows, "sh"))
     with atomic_path(path, "write_compressed_ply()") as partial:
         PlyData(elements, byte_order="<").write(str(partial))
-
-
-def _chunks(raw: Arrays) -> tuple[np.ndarray, Arrays]:
-    """Return the rows of the chunks, and the values [N, 3] as fractions between their bounds."""
-    values = {
-        "position": raw["means"],
-        "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
-        "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
-    }
-    names = [name for ends in _BOUNDS.values() for names in ends for name in names]
-    chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in names])
-    fractions = {}
-    for key, value in values.items():
-        value = value.astype(np.float32)
-        bounds = []
-        for names, bound in zip(_BOUNDS[key], (np.minimum, np.maximum), strict=True):
-            ends = bound.reduceat(value, np.arange(0, len(value), _CHUNK), axis=0)
-            for name, column in zip(names, ends.T, strict=True):
-                chunks[name] = column
-            bounds.append(_by_row(ends, len(value)))
-        low, high = bounds
-        fractions[key] = (value - low) / np.where(high > low, high - low, 1)
-    return chunks, fractions
 
 
 def read_compressed_ply(path: str | Path) -> Gaussians:

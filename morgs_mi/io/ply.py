@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -208,11 +207,38 @@ def read_elements(
     try:
         with existing_file(path, "a PLY file").open("rb") as file:
             order, elements = _read_header(file)
-            names = {element.name for element in elements}.intersection((*required, *optional))
+            names = {name for name, *_ in elements}.intersection((*required, *optional))
             for name in required:
                 if name not in names:
                     raise ValueError(f"it has no element {name}")
-            return _read_properties(file, order, elements, names)
+            properties: dict[str, Arrays] = {}
+            for element, count, fields in elements:
+                if properties.keys() == names:
+                    break
+                if any(kind == "list" for kind, *_ in fields):
+                    raise ValueError(f"its element {element} has lists, write it without them")
+                dtype = np.dtype([(name, order + _TYPES[kind]) for kind, name, *_ in fields])
+                # A number in a text takes a digit and a separator.
+                size = count * dtype.itemsize if order else 2 * count * len(fields) - 1
+                num_bytes = os.fstat(file.fileno()).st_size - file.tell()
+                if count < 0 or size > num_bytes:
+                    raise ValueError(f"{count} {element} need {size} bytes, {num_bytes} follow")
+                if element not in names:
+                    if order:
+                        file.seek(count * dtype.itemsize, 1)
+                    else:
+                        next(islice(file, count, count), None)
+                    continue
+                if order:
+                    table = np.fromfile(file, dtype, count)
+                elif count:
+                    table = np.loadtxt(islice(file, count), dtype, ndmin=1)
+                else:
+                    table = np.empty(0, dtype)
+                if len(table) < count:
+                    raise ValueError(f"expected {count} rows of {element}, got {len(table)}")
+                properties[element] = {name: table[name] for name in table.dtype.names or ()}
+            return properties
     except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise ValueError(
             f"{path}: expected a complete PLY file, got one that cannot be read: {error}; copy or "
@@ -220,19 +246,10 @@ def read_elements(
         ) from error
 
 
-@dataclass
-class _Element:
-    """An element of a PLY file: its name, its number of rows, and the lines of its properties,
-    split into words.
+def _read_header(file: BinaryIO) -> tuple[str, list[tuple[str, int, list[list[str]]]]]:
+    """Return the byte order, empty for text, and the elements: name, number of rows, and the words
+    of each property's line.
     """
-
-    name: str
-    count: int
-    properties: list[list[str]]
-
-
-def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
-    """Return the byte order, empty for text, and the elements."""
     if file.readline(8).strip() != b"ply":
         raise ValueError("it does not begin with `ply`")
     order = ""
@@ -245,47 +262,10 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
             case ["format", name, *_]:
                 order = _BYTE_ORDERS[name]
             case ["element", name, count, *_]:
-                elements.append(_Element(name, int(count), []))
+                elements.append((name, int(count), []))
             case ["property", *words]:
-                elements[-1].properties.append(words)
+                elements[-1][2].append(words)
     raise ValueError("its header does not end")
-
-
-def _read_properties(
-    file: BinaryIO, order: str, elements: Sequence[_Element], names: set[str]
-) -> dict[str, Arrays]:
-    """Return the properties of the elements in `names`; those after the last of these are not
-    read.
-    """
-    properties: dict[str, Arrays] = {}
-    for element in elements:
-        if properties.keys() == names:
-            break
-        if any(words[0] == "list" for words in element.properties):
-            raise ValueError(f"its element {element.name} has lists, write it without them")
-        dtype = np.dtype([(words[1], order + _TYPES[words[0]]) for words in element.properties])
-        count = element.count
-        # A number in a text takes a digit and a separator.
-        size = count * dtype.itemsize if order else 2 * count * len(element.properties) - 1
-        num_bytes = os.fstat(file.fileno()).st_size - file.tell()
-        if count < 0 or size > num_bytes:
-            raise ValueError(f"{count} {element.name} need {size} bytes, {num_bytes} follow")
-        is_read = element.name in names
-        if order and not is_read:
-            file.seek(count * dtype.itemsize, 1)
-        elif not is_read:
-            next(islice(file, count, count), None)
-        else:
-            if order:
-                table = np.fromfile(file, dtype, count)
-            elif count:
-                table = np.loadtxt(islice(file, count), dtype, ndmin=1)
-            else:
-                table = np.empty(0, dtype)
-            if len(table) < count:
-                raise ValueError(f"expected {count} rows of {element.name}, got {len(table)}")
-            properties[element.name] = {name: table[name] for name in table.dtype.names or ()}
-    return properties
 
 
 def rest_names(K: int) -> tuple[str, ...]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Generic, TypeVar
+
+from morgs_mi.core.extras import extra_function, places
 
 Made = TypeVar("Made")
 Config = TypeVar("Config")
@@ -57,6 +61,19 @@ class Registry(Generic[Made, Config]):
             return factory
 
         return add
+
+    def fill(self, package: str, path: Iterable[str], extras: str) -> None:
+        """Import the modules of a package, which register themselves, and register what extras add.
+
+        Args:
+            package: its name.
+            path: its folders.
+            extras: kind of these entries of extras.
+        """
+        for module in iter_modules(path):
+            import_module(f"{package}.{module.name}")
+        for name in places(extras):
+            self.register(*name.split(":"))(extra_function(extras, name))
 
     @property
     def usages(self) -> tuple[str, ...]:

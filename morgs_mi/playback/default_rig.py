@@ -118,7 +118,22 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     Raises:
         ValueError: there is no Gaussian in any of the frames.
     """
-    low, high, size = _extent(frames)
+    # The corners of the box around most of the opacity, and the median size of a Gaussian.
+    raw = [gaussians.numpy() for gaussians in frames]
+    means, logits = (
+        np.concatenate([values[name] for values in raw], dtype=np.float64)
+        for name in ("means", "logit_opacities")
+    )
+    if not len(means):
+        raise ValueError("expected at least one Gaussian, got none; leave out files without any.")
+    weights = expit(logits) + 1e-9
+    percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
+    corners = [
+        np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T
+    ]
+    low, high = np.array(corners).T
+    sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
+    size = float(np.exp(np.median(sizes)))
     # A single Gaussian has no extent but its own, and one without extent is at least larger than
     # rounding errors.
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
@@ -156,27 +171,6 @@ def _detail(gaussians: Gaussians, camera: Camera) -> float:
     """Return the mean difference between neighbouring pixels of a view."""
     image = np.array(rasterize(gaussians, camera, ("color",)).color).clip(0, 1)
     return sum(float(np.abs(np.diff(image, axis=axis)).mean()) for axis in (0, 1))
-
-
-def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the corners [3] of the box around most of the opacity in all frames, and the median
-    size of a Gaussian.
-    """
-    raw = [gaussians.numpy() for gaussians in frames]
-    means, logits = (
-        np.concatenate([values[name] for values in raw], dtype=np.float64)
-        for name in ("means", "logit_opacities")
-    )
-    if not len(means):
-        raise ValueError("expected at least one Gaussian, got none; leave out files without any.")
-    weights = expit(logits) + 1e-9
-    percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
-    corners = [
-        np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T
-    ]
-    low, high = np.array(corners).T
-    sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
-    return low, high, float(np.exp(np.median(sizes)))
 
 
 def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tuple[Camera, ...]]:

@@ -111,14 +111,15 @@ def _in_front(
     camera = view.pixels.camera
     x, y, width, height = view.pixels.crop
     limit = np.full((camera.height, camera.width), np.inf, np.float32)
-    limit[y : y + height, x : x + width] = np.array(view.depth).reshape(height, width)
+    pixels = np.s_[y : y + height, x : x + width]
+    limit[pixels] = np.array(view.depth).reshape(height, width)
     mask = np.isfinite(limit)
     if not mask.any():
         return None
     region = Region.of(mask)
     part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=limit)
     index_image = region.uncropped(np.arange(region.num_pixels).reshape(region.shape(1)[:3]))
-    index = from_numpy(mi.UInt32, index_image[y : y + height, x : x + width])
+    index = from_numpy(mi.UInt32, index_image[pixels])
     has_surface = view.coverage > 0
 
     def on_crop(image: Tensor) -> list[Float]:

@@ -181,7 +181,7 @@ def calibrate(
     path = Path(path)
     config = config or CalibrateConfig()
     check_ranges(config, "calibrate()")
-    report = progress or (lambda stage, done, total: None)
+    report = progress or (lambda *_: None)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
     if (path / "sparse").exists() and not overwrite:

@@ -88,13 +88,14 @@ class Info:
             _print_stream(self.capture)
             return
         capture = load_capture(self.capture, reading=self.reading.read_config())
-        points = f"{len(capture.points)} points" if len(capture.points) else "without points"
+        count = len(capture.points)
+        points = f"{count} points" if count else "without points"
         rig_check = None
         if self.check:
             with progress() as report:
                 shared = match_capture(capture, partial(report, "Matching views"))
             rig_check = check_rig(capture, shared)
-            if not len(capture.points):
+            if not count:
                 capture = triangulate_points(capture, shared)
                 points += f" ({len(capture.points)} can be triangulated)"
         train_cameras = [capture.cameras[v] for v in capture.train_views]
@@ -159,7 +160,7 @@ class Calibrate:
                 self.folder,
                 self.config,
                 self.overwrite,
-                lambda *stage: report(*stage),
+                report,
                 self.exclude,
             )
         table = _check_table(str(result.model), ("camera", "points", "error, px", "pose"))

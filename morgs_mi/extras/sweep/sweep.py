@@ -327,19 +327,20 @@ def fit_arms(
     first_frames = []
     scores = np.full((len(arms), seeds, len(TITLES)), np.nan)
     fits = Progress(progress, "Fitting and evaluating")
+    total = seeds * len(arms)
     with locked_folder(out, "sweep()"):
         for seed in range(seeds):
             first = out / f"first-seed{seed}"
             curve = scores_of(first, replace(first_config, seed=seed), None, fit_first)
             first_frames.append(curve)
             for k, (name, config, shares_first) in enumerate(arms):
-                stage = fits.part(seed * len(arms) + k, seeds * len(arms))
+                stage = fits.part(seed * len(arms) + k, total)
                 label = f"{name}-epochs{config.fit.epochs}-seed{seed}"
                 folder = out / label.replace(", ", "+").replace(" ", "-")
                 start = first if shares_first else None
                 fit = partial(_fit_later, capture, start, stage)
                 scores[k, seed] = scores_of(folder, replace(config, seed=seed), curve, fit)
-        fits(seeds * len(arms), seeds * len(arms))
+        fits(total, total)
     names, configs, _ = zip(*arms, strict=True)
     epochs = [config.fit.epochs for config in configs]
     return SweepResult(

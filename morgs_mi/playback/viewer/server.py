@@ -104,7 +104,15 @@ class Viewer:
         if ip_address(address).is_unspecified:
             name = "localhost"
         self.url = f"http://{name}:{port}/{token and token + '/'}"
-        config = uvicorn.Config(Access(self._app(), host, token), **_OPTIONS)
+        routes = [
+            Route("/", self._send_page),
+            Route(f"/{STREAM}", self._send_stream),
+            Route("/recorded/{view:int}/{frame:int}", self._send_recorded),
+            Route("/exact/{frame:int}/{channel}", self._send_exact),
+        ]
+        handlers = {OSError: _failed, ValueError: _failed}
+        app = Starlette(routes=routes, exception_handlers=handlers)
+        config = uvicorn.Config(Access(app, host, token), **_OPTIONS)
         self._server = uvicorn.Server(config)
 
     def run(self) -> None:
@@ -122,15 +130,6 @@ class Viewer:
     def close(self) -> None:
         """Release the address of a page that is not served."""
         self._socket.close()
-
-    def _app(self) -> Starlette:
-        routes = [
-            Route("/", self._send_page),
-            Route(f"/{STREAM}", self._send_stream),
-            Route("/recorded/{view:int}/{frame:int}", self._send_recorded),
-            Route("/exact/{frame:int}/{channel}", self._send_exact),
-        ]
-        return Starlette(routes=routes, exception_handlers={OSError: _failed, ValueError: _failed})
 
     def _newest(self) -> Path:
         """Return the path of the stream, or of the provisional first frame beside it while it has

@@ -95,7 +95,19 @@ def rig_candidates(
     else:
         conventions = {reader.name: reader.poses for reader in reader_registry.READERS}
         poses = conventions.get(capture.layout, PoseConvention())
-        yield from _other_conventions(cameras, poses) if poses else ()
+        if poses:
+            # Images do not determine a rotation of the world, so there are only four
+            # distinguishable conventions of 4x4 matrices.
+            inverses = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
+            forth = poses.direction
+            back = "world to camera" if forth == "camera to world" else "camera to world"
+            remedy = f"expected {forth} in {_AXES[poses.axes]}; convert them"
+            for rig, direction, axes in (
+                (_turned(cameras, _FLIP), forth, "OpenCV" if poses.axes == "OpenGL" else "OpenGL"),
+                (inverses, back, "OpenCV"),
+                (_turned(inverses, _FLIP), back, "OpenGL"),
+            ):
+                yield rig, f"the poses seem to be {direction} in {_AXES[axes]}; {remedy}"
     if len(cameras) <= _MAX_EXCHANGED:
         for i, j in combinations(range(len(cameras)), 2):
             rig = [*cameras]
@@ -172,26 +184,3 @@ def with_focal_factor(camera: Camera, factor: float) -> Camera:
 def _turned(cameras: Sequence[Camera], rotation: np.ndarray) -> list[Camera]:
     """Return the cameras with a rotation [4, 4] of their axes."""
     return [replace(camera, viewmat=rotation @ camera.viewmat) for camera in cameras]
-
-
-def _other_conventions(
-    cameras: Sequence[Camera], expected: PoseConvention
-) -> list[tuple[Sequence[Camera], str]]:
-    """Return the alternatives for poses in 4x4 matrices.
-
-    Images do not determine a rotation of the world, so there are only four distinguishable
-    conventions: camera to world or the inverse, in OpenCV's axes or OpenGL's.
-    """
-    inverses = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
-    other_axes = "OpenCV" if expected.axes == "OpenGL" else "OpenGL"
-    inverse = "world to camera" if expected.direction == "camera to world" else "camera to world"
-    options = [
-        (_turned(cameras, _FLIP), expected.direction, other_axes),
-        (inverses, inverse, "OpenCV"),
-        (_turned(inverses, _FLIP), inverse, "OpenGL"),
-    ]
-    remedy = f"expected {expected.direction} in {_AXES[expected.axes]}; convert them"
-    return [
-        (cameras, f"the poses seem to be {direction} in {_AXES[axes]}; {remedy}")
-        for cameras, direction, axes in options
-    ]
