@@ -24,11 +24,10 @@ from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_firs
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import MIN_POINTS, FirstFrameProblem
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.input_images import Frame
+from morgs_mi.loop.input_images import Frame, Images
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
-    Images,
     Setup,
     observe_frame,
     prepare,

@@ -23,6 +23,8 @@ InputImage: TypeAlias = Any
 
 Frame: TypeAlias = "Sequence[InputImage | None] | Mapping[str, InputImage | None]"
 """One image or None for each view in the cameras' order, or the images by the cameras' names."""
+Images = Mapping[int, np.ndarray]
+"""Images of those views that have one, by view index."""
 
 
 def as_array(image: Any) -> Any:
@@ -133,9 +135,7 @@ _LEAST_CHANGED = 0.4
 _CHANGE = 8.0
 
 
-def image_status(
-    names: Sequence[str], previous: Mapping[int, np.ndarray], images: Mapping[int, np.ndarray]
-) -> tuple[str, ...]:
+def image_status(names: Sequence[str], previous: Images, images: Images) -> tuple[str, ...]:
     """Return a sentence with advice for each problem of a frame's images.
 
     Args:

@@ -19,7 +19,7 @@ from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.budget import check_capacity
 from morgs_mi.fit.view import View
-from morgs_mi.loop.input_images import Frame, copied_images
+from morgs_mi.loop.input_images import Frame, Images, copied_images
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
@@ -28,9 +28,6 @@ from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.objective import KeyView
-
-# Images of those views that have one, by view index.
-Images = Mapping[int, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)

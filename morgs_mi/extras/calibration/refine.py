@@ -5,7 +5,7 @@ Beyond the paper. With enough feature matches, bundle adjustment gives a first e
 `bundle`). Rounds then lower the difference between images and renderings. A round is a short fit of
 Gaussians, followed by Gauss-Newton steps for all cameras and the means of all Gaussians at once.
 With the blend weights w fixed, the error e = target - image of a view is linear in the shift u of a
-splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g, it becomes e + g .
+splat (Lucas and Kanade 1981; as in `method.motion`): with the gradient g, it becomes e + g .
 u. A Gaussian is therefore an observation of `NormalEquations` in each view, with
 
     G = sum_x w g g' / v,    b = sum_x w e g / v,
