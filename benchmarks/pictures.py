@@ -1,9 +1,10 @@
-"""Draw the stages of one frame of the demo's clip, for the page docs/how-it-works.md.
+"""Draw the demo as a moving picture for the README, and the stages of one frame of its clip for the
+page docs/how-it-works.md.
 
+    morgs-mi demo out/demo
     python -m benchmarks.pictures
 
-The clip of `morgs-mi demo` is made in `out/demo/capture` unless it is there. All images show one
-key view.
+Without the demo, its clip alone is made. All stages show one key view.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.extras.demo.demo import DemoConfig
 from morgs_mi.extras.synth.synthesize import synthesize
+from morgs_mi.io.video import VideoReader
 from morgs_mi.loop.observation import FrameObservation, observe_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.lift import lift_flow
@@ -29,6 +31,9 @@ from morgs_mi.playback.visualise import confidence_image, grey_image, motion_ima
 from morgs_mi.stream_loop import StreamLoop
 
 _CAPTURE = Path("out/demo/capture")
+_VIDEO = Path("out/demo/side_by_side.mp4")
+_MOVING_PICTURE = Path("docs/demo.webp")
+_QUALITY = 80
 _OUT = Path("docs/how-it-works")
 _FRAME = 5  # a multiple of `mask_interval`, at which motion masks are computed
 _ERROR_GAIN = 10
@@ -36,8 +41,14 @@ _JPEG_QUALITY = 90
 
 
 def main() -> None:
-    """Fit the clip up to the frame and write a JPEG file per stage."""
+    """Write the moving picture, fit the clip up to the frame, and write a JPEG file per stage."""
     mi.set_variant("llvm_ad_rgb")
+    if _VIDEO.exists():
+        video = VideoReader.open(_VIDEO)
+        animation = cv2.Animation()
+        animation.frames = [frame[..., ::-1].copy() for frame in video.frames()]
+        animation.durations = np.full(video.num_frames, 1e3 / (video.fps or 1), np.int32)
+        cv2.imwriteanimation(str(_MOVING_PICTURE), animation, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     config = DemoConfig()
     if not _CAPTURE.exists():
         synthesize(config.scene, _CAPTURE, replace(config.clip, seed=config.stream.seed))

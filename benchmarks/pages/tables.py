@@ -174,7 +174,9 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "frame_times": frame_times,
     "fuzz": fuzz,
     "gains": gains,
-    "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
+    "held_out_views": lambda: held_out.first_frames(
+        committed("held_out")["fits"], committed("held_out_seeds")["fits"]
+    ),
     "parts": parts,
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     "splat_files": splat_files,

@@ -70,19 +70,26 @@ def scores_of(out: Path) -> dict[str, Any]:
     }
 
 
-def first_frames(fits: Sequence[dict[str, Any]]) -> str:
+def first_frames(fits: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]] = ()) -> str:
     """Return the PSNR of each held-out view in the first frame as recorded, and the means with
-    matched colours too.
+    matched colours too; and the range of the means of `others`, fits with several seeds, which are
+    named RECORDING-SEED.
     """
     rows = []
+    means_of_seeds: dict[str, list[float]] = {}
+    for fit in others:
+        psnr = float(np.mean([scores["psnr"] for scores in fit["views"].values()]))
+        means_of_seeds.setdefault(fit["recording"].rpartition("-")[0], []).append(psnr)
     for fit in fits:
         views = fit["views"].values()
         cells = f"{fit['training_views']}", f"{fit['gaussians']:,}"
         balance = "yes" if fit["is_balanced"] else "no"
         psnrs = ", ".join(f"{scores['psnr']:.1f}" for scores in views)
         means = (f"{np.mean([scores[key] for scores in views]):.2f}" for key in _SCORES[:2])
-        rows.append((fit["recording"], *cells, balance, psnrs, *means))
-    titles = "training views", "Gaussians", "balanced", "held-out views, dB", "mean", "matched"
+        seeds = means_of_seeds.get(fit["recording"], [])
+        spread = f"{min(seeds):.2f} to {max(seeds):.2f}" if seeds else "-"
+        rows.append((fit["recording"], *cells, balance, psnrs, *means, spread))
+    titles = "training views", "Gaussians", "balanced", "held-out views, dB", "mean", "matched", "three seeds"
     return markdown(("recording", *titles), rows, left=1)
 
 
