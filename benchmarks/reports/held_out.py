@@ -89,8 +89,8 @@ def first_frames(fits: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]
         seeds = means_of_seeds.get(fit["recording"], [])
         spread = f"{min(seeds):.2f} to {max(seeds):.2f}" if seeds else "-"
         rows.append((fit["recording"], *cells, balance, psnrs, *means, spread))
-    titles = "training views", "Gaussians", "balanced", "held-out views, dB", "mean", "matched", "three seeds"
-    return markdown(("recording", *titles), rows, left=1)
+    titles = "training views", "Gaussians", "balanced", "held-out views, dB"
+    return markdown(("recording", *titles, "mean", "matched", "three seeds"), rows, left=1)
 
 
 def later_frames(fits: Sequence[dict[str, Any]]) -> str:
