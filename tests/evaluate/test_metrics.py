@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.testing import assert_allclose
 
 from morgs_mi.evaluate.metrics import (
@@ -14,27 +13,11 @@ from morgs_mi.evaluate.metrics import (
     psnr_mu,
     ssim_map,
 )
+from tests.reference import ssim_by_windows
 
 rng = np.random.default_rng(0)
 TRUTH = rng.random((24, 31, 3))
 NOISY = np.clip(TRUTH + rng.normal(0, 0.1, TRUTH.shape), 0, 1)
-
-
-def ssim_by_windows(image, truth):
-    """SSIM of one channel in every window, as the paper writes it."""
-    i = np.arange(-5, 6)
-    w = np.exp(-(i[:, None] ** 2 + i**2) / (2 * 1.5**2))
-    x, y = (sliding_window_view(each, (11, 11)) for each in (image, truth))
-
-    def mean(values):
-        return (values * w).sum((2, 3), keepdims=True) / w.sum()
-
-    mx = mean(x)
-    my = mean(y)
-    covariance = mean((x - mx) * (y - my))
-    variances = mean((x - mx) ** 2) + mean((y - my) ** 2)
-    top = (2 * mx * my + 1e-4) * (2 * covariance + 9e-4)
-    return (top / ((mx**2 + my**2 + 1e-4) * (variances + 9e-4)))[..., 0, 0]
 
 
 def test_psnr__of_a_known_error():

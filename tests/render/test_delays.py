@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -12,7 +11,7 @@ from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_camera
-from tests.scenes.derivatives import gradient
+from tests.scenes.derivatives import assert_backward_agrees_with_differences
 from tests.scenes.gaussians import make_scene, to_gaussians
 
 
@@ -42,21 +41,8 @@ def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving):
 
 def test_rasterize__backward_agrees_with_central_differences_after_a_delay(moving):
     raw, camera = moving
-    camera = replace(camera, delay=-0.3, readout=0.6)
-
-    def loss(gaussians):
-        return dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None)
-
-    gaussians = to_gaussians(raw, grad=True)
-    dr.backward(loss(gaussians))
-    rng = np.random.default_rng(4)
-    for name in ("means", "motion"):
-        grad = gradient(getattr(gaussians, name))
-        v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
-        h = 2e-3
-        up, down = (loss(to_gaussians({**raw, name: raw[name] + s * h * v})) for s in (1, -1))
-        difference = (np.asarray(up).item() - np.asarray(down).item()) / (2 * h)
-        assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
+    delayed = replace(camera, delay=-0.3, readout=0.6)
+    assert_backward_agrees_with_differences(raw, delayed, ("means", "motion"))
 
 
 def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving):

@@ -15,8 +15,12 @@ from tests import reference
 from tests import tolerances as tol
 from tests.reference import rasterize_view
 from tests.scenes.cameras import look_at_cameras
-from tests.scenes.derivatives import backward
-from tests.scenes.gaussians import CHANNELS, RAW, isotropic, to_gaussians
+from tests.scenes.derivatives import (
+    assert_forward_agrees_with_reference,
+    assert_gradients_of_reference,
+    random_weight,
+)
+from tests.scenes.gaussians import CHANNELS, isotropic, to_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -43,45 +47,17 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel):
     raw, camera = scene
-    rng = np.random.default_rng(1)
-    size = {"color": 3, "motion": 2}.get(channel, 1)
-    weight = rng.normal(size=(camera.height, camera.width, size))
-    weight *= rasterize_view(raw, camera, depth_limit=limit)["alpha"] > 0.1
-    gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, (channel,), depth_limit=limit)
-    backward(image[channel] * mi.TensorXf(np.float32(weight)))
-
-    def loss(values):
-        return np.sum(rasterize_view(values, camera, depth_limit=limit)[channel] * weight)
-
-    expected = reference.complex_step(loss, raw, list(RAW))
-    for name in RAW:
-        if np.abs(expected[name]).max() > 0:
-            assert_close(
-                dr.grad(getattr(gaussians, name)),
-                expected[name],
-                rtol=5 * tol.GRADIENT_REL,
-                name=name,
-            )
+    solid = rasterize_view(raw, camera, depth_limit=limit)["alpha"] > 0.1
+    weight = random_weight(camera, channel, 1) * solid
+    rtol = 5 * tol.GRADIENT_REL
+    assert_gradients_of_reference(raw, camera, channel, weight, rtol=rtol, depth_limit=limit)
 
 
 @pytest.mark.slow
 def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
-    raw, camera = scene
-    rng = np.random.default_rng(2)
-    direction = {
-        name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW
-    }
-    gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, ("color", "alpha"), depth_limit=limit)
-    for name in RAW:
-        dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(direction[name])))
-    dr.forward_to(image.color, image.alpha)
-    for name in ("color", "alpha"):
-        expected = reference.directional(
-            lambda v, name=name: rasterize_view(v, camera, depth_limit=limit)[name], raw, direction
-        )
-        assert_close(dr.grad(image[name]), expected, rtol=5 * tol.GRADIENT_REL, name=name)
+    assert_forward_agrees_with_reference(
+        *scene, ("color", "alpha"), 5 * tol.GRADIENT_REL, depth_limit=limit
+    )
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from tests.render.exact import (
     run,
     weights,
 )
+from tests.scenes.derivatives import tangents
 from tests.scenes.extremes import CASES, REFUSED, eye, random_case, raw_gaussians
 from tests.scenes.gaussians import CHANNELS
 
@@ -59,15 +60,13 @@ def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
         _, grads = run(case.values, case.camera, weight)
         gaussians = Activated(case.values)
         image = rasterize(gaussians, case.camera, CHANNELS, BACKGROUND, config=CONFIG)
+        steps = {}
         for name in ATTRIBUTES:
             # Steps as long as the attribute: a unit step of a scale of 1e-38 would overflow.
-            step = np.sign(grads[name]) * np.minimum(np.abs(case.values[name]), 1e6)
-            dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(step)))
-            grads[name] = np.vdot(grads[name], step)
-        outputs = [image[name] for name in CHANNELS]
-        dr.forward_to(outputs)
-        tangents = [np.asarray(dr.grad(output), np.float64) for output in outputs]
-        forward = sum(np.vdot(t, weight[name]) for t, name in zip(tangents, CHANNELS, strict=True))
+            steps[name] = np.sign(grads[name]) * np.minimum(np.abs(case.values[name]), 1e6)
+            grads[name] = np.vdot(grads[name], steps[name])
+        results = tangents(gaussians, steps, [image[name] for name in CHANNELS])
+        forward = sum(np.vdot(t, weight[name]) for t, name in zip(results, CHANNELS, strict=True))
         reverse = sum(grads.values())
         if not abs(forward - reverse) <= tol.DUALITY_REL * abs(reverse):
             failed.append(f"{case.name}: forward {forward:.7g}, reverse {reverse:.7g}")

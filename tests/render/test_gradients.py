@@ -13,7 +13,16 @@ from tests import reference
 from tests import tolerances as tol
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_camera
-from tests.scenes.derivatives import backward
+from tests.scenes.derivatives import (
+    assert_backward_agrees_with_differences,
+    assert_forward_agrees_with_reference,
+    assert_gradients_of_reference,
+    backward,
+    gradient,
+    random_direction,
+    random_weight,
+    tangents,
+)
 from tests.scenes.gaussians import (
     CHANNELS,
     RAW,
@@ -26,76 +35,37 @@ from tests.scenes.gaussians import (
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_rasterize__backward_agrees_with_the_reference_for_every_attribute(scene, channel):
     raw, camera = scene
-    rng = np.random.default_rng(1)
-    size = {"color": 3, "motion": 2}.get(channel, 1)
-    weight = rng.normal(size=(camera.height, camera.width, size)) * (
-        rasterize_view(raw, camera)["alpha"] > 0.02
-    )
+    weight = random_weight(camera, channel, 1) * (rasterize_view(raw, camera)["alpha"] > 0.02)
     background = (0.2, 0.5, 0.9) if channel == "color" else None
-
-    gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, (channel,), background)
-    backward(image[channel] * mi.TensorXf(np.float32(weight)))
-    expected = reference.complex_step(
-        lambda values: np.sum(rasterize_view(values, camera, background)[channel] * weight),
-        raw,
-        list(RAW),
-    )
-    for name in RAW:
-        gradient = np.asarray(dr.grad(getattr(gaussians, name)))
-        assert np.isfinite(gradient).all()
-        if np.abs(expected[name]).max() == 0:
-            assert np.abs(gradient).max() == 0, f"{channel} must not depend on {name}"
-        else:
-            assert_close(gradient, expected[name], rtol=tol.GRADIENT_REL, name=name)
+    assert_gradients_of_reference(raw, camera, channel, weight, background=background)
 
 
 def test_rasterize__antialiased_image_and_gradient_agree_with_the_reference(scene):
     raw, camera = scene
     raw = {**raw, "log_scales": raw["log_scales"] - 1.5}  # about a pixel, where the filter matters
-    weight = np.random.default_rng(5).normal(size=(camera.height, camera.width, 3))
-
-    def image_of(values):
-        return rasterize_view(values, camera, antialiased=True)["color"]
-
-    gaussians = to_gaussians(raw, grad=True)
-    color = rasterize(gaussians, camera, ("color",), config=RenderConfig(antialiased=True)).color
-    backward(color * mi.TensorXf(np.float32(weight)))
-    assert_close(color, image_of(raw), atol=tol.IMAGE_ABS)
-    assert np.abs(image_of(raw) - rasterize_view(raw, camera)["color"]).max() > 0.1
-    names = ["means", "log_scales", "quats", "logit_opacities"]
-    expected = reference.complex_step(lambda values: np.sum(image_of(values) * weight), raw, names)
-    for name in names:
-        assert_close(
-            dr.grad(getattr(gaussians, name)), expected[name], rtol=tol.GRADIENT_REL, name=name
-        )
+    config = RenderConfig(antialiased=True)
+    color = rasterize(to_gaussians(raw), camera, ("color",), config=config).color
+    expected = rasterize_view(raw, camera, antialiased=True)["color"]
+    assert_close(color, expected, atol=tol.IMAGE_ABS)
+    assert np.abs(expected - rasterize_view(raw, camera)["color"]).max() > 0.1
+    assert_gradients_of_reference(
+        raw,
+        camera,
+        "color",
+        random_weight(camera, "color", 5),
+        names=("means", "log_scales", "quats", "logit_opacities"),
+        antialiased=True,
+    )
 
 
 def test_rasterize__forward_mode_agrees_with_the_reference(scene):
-    raw, camera = scene
-    rng = np.random.default_rng(2)
-    direction = {
-        name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW
-    }
-    gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, CHANNELS)
-    for name in RAW:
-        dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(direction[name])))
-    outputs = [image[name] for name in CHANNELS]
-    dr.forward_to(outputs)
-    for name, output in zip(CHANNELS, outputs, strict=True):
-        expected = reference.directional(
-            lambda v, name=name: rasterize_view(v, camera)[name], raw, direction
-        )
-        solid = rasterize_view(raw, camera)["alpha"] > 0.02
-        assert_close(dr.grad(output), expected, rtol=tol.GRADIENT_REL, where=solid, name=name)
+    assert_forward_agrees_with_reference(*scene, CHANNELS, tol.GRADIENT_REL)
 
 
 def test_rasterize__forward_and_reverse_mode_are_dual(scene):
     """<g, J v> = <J' g, v> for random g and v over all channels and attributes at once."""
     raw, camera = scene
-    rng = np.random.default_rng(3)
-    directions = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
+    directions = random_direction(raw, 3)
 
     def loss(gaussians):
         image = rasterize(gaussians, camera, ("color", "confidence"), (0.1, 0.2, 0.3))
@@ -105,38 +75,14 @@ def test_rasterize__forward_and_reverse_mode_are_dual(scene):
 
     gaussians = to_gaussians(raw, grad=True)
     dr.backward(loss(gaussians))
-    reverse = sum(
-        np.vdot(np.asarray(dr.grad(getattr(gaussians, n)), np.float64), v)
-        for n, v in directions.items()
-    )
+    reverse = sum(np.vdot(gradient(getattr(gaussians, n)), v) for n, v in directions.items())
     gaussians = to_gaussians(raw, grad=True)
-    value = loss(gaussians)
-    for name, v in directions.items():
-        dr.set_grad(getattr(gaussians, name), mi.TensorXf(v))
-    dr.forward_to(value)
-    forward = float(np.asarray(dr.grad(value)).ravel()[0])
-    assert forward == pytest.approx(reverse, rel=tol.DUALITY_REL)
+    (forward,) = tangents(gaussians, directions, [loss(gaussians)])
+    assert forward.item() == pytest.approx(reverse, rel=tol.DUALITY_REL)
 
 
 def test_rasterize__backward_agrees_with_central_differences(scene):
-    raw, camera = scene
-
-    def loss(values):
-        return dr.sum(
-            dr.square(rasterize(to_gaussians(values), camera, ("color",)).color), axis=None
-        )
-
-    gaussians = to_gaussians(raw, grad=True)
-    backward(dr.square(rasterize(gaussians, camera, ("color",)).color))
-    rng = np.random.default_rng(4)
-    for name in RAW[:5]:
-        # The direction is the sign of the gradient: no cancellation hides an error.
-        grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
-        v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
-        h = 2e-3
-        up, down = ({**raw, name: raw[name] + s * h * v} for s in (1, -1))
-        difference = (np.asarray(loss(up)).item() - np.asarray(loss(down)).item()) / (2 * h)
-        assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
+    assert_backward_agrees_with_differences(*scene, RAW[:5])
 
 
 def test_rasterize__gradient_of_the_pose_agrees_with_the_reference(scene):
@@ -167,19 +113,15 @@ def test_rasterize__detached_weights_give_geometry_no_gradient(scene):
 
 @pytest.mark.slow
 def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
-    raw = as_float32(make_scene(0, 40, seed=7))
     camera = make_camera(30, 25)
-    weight = np.random.default_rng(8).normal(size=(25, 30, 3))
-    gaussians = to_gaussians(raw, grad=True)
-    backward(rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)))
-    names = ["means", "log_scales", "logit_opacities"]
-    expected = reference.complex_step(
-        lambda v: np.sum(rasterize_view(v, camera)["color"] * weight), raw, names
+    assert_gradients_of_reference(
+        as_float32(make_scene(0, 40, seed=7)),
+        camera,
+        "color",
+        random_weight(camera, "color", 8),
+        names=("means", "log_scales", "logit_opacities"),
+        rtol=10 * tol.GRADIENT_REL,
     )
-    for name in names:
-        assert_close(
-            dr.grad(getattr(gaussians, name)), expected[name], rtol=10 * tol.GRADIENT_REL, name=name
-        )
 
 
 @pytest.mark.skipif("llvm" not in mi.variant(), reason="a GPU sums in no fixed order")

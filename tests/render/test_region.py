@@ -11,8 +11,8 @@ from morgs_mi.render.region import BlockGrid, Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_wide_camera
-from tests.scenes.derivatives import backward, gradient
-from tests.scenes.gaussians import CHANNELS, RAW, make_wide_scene
+from tests.scenes.derivatives import backward, gradient, random_direction, random_weight, tangents
+from tests.scenes.gaussians import CHANNELS, RAW, make_wide_scene, to_gaussians
 from tests.scenes.kernels import compiled_by
 
 BACKGROUND = (0.2, 0.5, 0.9)
@@ -39,8 +39,7 @@ def mask(camera):
 
 def run(raw, camera, region=None, weight=None, config=None):
     """Return images and gradients of <image, weight>, with the weight cropped to the region."""
-    gaussians = Gaussians(**raw)
-    dr.enable_grad(*gaussians.items().values())
+    gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, config=config)
     images = {name: image[name] for name in CHANNELS}
     if weight is not None:
@@ -57,10 +56,8 @@ def run(raw, camera, region=None, weight=None, config=None):
 @pytest.fixture(scope="module")
 def weight(camera, mask):
     """Random weights on the pixels of the region's blocks, 0 elsewhere."""
-    rng = np.random.default_rng(3)
     drawn = drawn_pixels(Region.of(mask), mask)
-    sizes = {"color": 3, "motion": 2}
-    return {name: rng.normal(size=(*mask.shape, sizes.get(name, 1))) * drawn for name in CHANNELS}
+    return {name: random_weight(camera, name, 3) * drawn for name in CHANNELS}
 
 
 def drawn_pixels(region, mask):
@@ -114,26 +111,16 @@ def test_rasterize__blends_features_on_a_region(raw, camera, mask):
 
 
 def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
-    rng = np.random.default_rng(1)
     region = Region.of(mask)
-    tangents = []
-    direction = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
+    results = []
     for where in (region, None):
-        gaussians = Gaussians(**raw)
-        dr.enable_grad(*gaussians.items().values())
+        gaussians = to_gaussians(raw, grad=True)
         image = rasterize(gaussians, camera, CHANNELS, region=where)
-        for name in RAW:
-            dr.set_grad(getattr(gaussians, name), mi.TensorXf(direction[name]))
         outputs = [image[name] for name in CHANNELS]
-        dr.forward_to(outputs)
-        tangents.append([gradient(output) for output in outputs])
-    for name, tangent, expected in zip(CHANNELS, *tangents, strict=True):
-        assert_close(
-            tangent,
-            region.crop(expected),
-            atol=tol.SUM_ORDER_REL * np.abs(expected).max(),
-            name=name,
-        )
+        results.append(tangents(gaussians, random_direction(raw, 1), outputs))
+    for name, tangent, expected in zip(CHANNELS, *results, strict=True):
+        atol = tol.SUM_ORDER_REL * np.abs(expected).max()
+        assert_close(tangent, region.crop(expected), atol=atol, name=name)
 
 
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
@@ -163,8 +150,7 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
     """Another region with another number of Gaussians compiles no kernel."""
 
     def step(where):
-        gaussians = Gaussians(**raw)
-        dr.enable_grad(*gaussians.items().values())
+        gaussians = to_gaussians(raw, grad=True)
         image = rasterize(gaussians, camera, ("color",), region=Region.of(where))
         backward(image.color)
         dr.eval(dr.grad(gaussians.means))
