@@ -23,6 +23,12 @@ def gradient(tensor):
     return np.array(dr.grad(tensor), np.float64)
 
 
+def difference(function, at, direction, step):
+    """Return the central difference of a scalar along a direction."""
+    up, down = (np.asarray(function(np.asarray(at) + s * step * direction)).item() for s in (1, -1))
+    return (up - down) / (2 * step)
+
+
 def tangents(gaussians, direction, outputs):
     """Return the derivatives of tensors along a change of the attributes."""
     for name, change in direction.items():
@@ -86,11 +92,11 @@ def assert_backward_agrees_with_differences(raw, camera, names):
     gaussians = to_gaussians(raw, grad=True)
     dr.backward(loss(gaussians))
     rng = np.random.default_rng(4)
-    h = 2e-3
     for name in names:
         # The direction is the sign of the gradient: no cancellation hides an error.
         grad = gradient(getattr(gaussians, name))
         v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
-        up, down = (loss(to_gaussians({**raw, name: raw[name] + s * h * v})) for s in (1, -1))
-        difference = (np.asarray(up).item() - np.asarray(down).item()) / (2 * h)
-        assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
+        slope = difference(
+            lambda value, name=name: loss(to_gaussians({**raw, name: value})), raw[name], v, 2e-3
+        )
+        assert slope == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
