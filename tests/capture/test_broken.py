@@ -102,10 +102,6 @@ POSES_BOUNDS = {
         pipe("capture.json"),
         "capture.json: expected a file, got a folder, a pipe or a device; remove it",
     ),
-    "no clip": (
-        missing("cam02.mkv"),
-        r"expected one row per camera, got 3 rows for 2 videos \(cam00, cam11\)",
-    ),
     "far offset": (
         lambda path: None,
         "no timestamp in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
@@ -169,10 +165,6 @@ NERFSTUDIO = {
         transforms(lambda m: m.update(frames=[])),
         "transforms.json: `frames` must be a list of objects, got \\[\\]",
     ),
-    "broken file": (
-        truncated("transforms.json"),
-        "transforms.json: expected JSON, got a broken file",
-    ),
     "unnamed": (
         transforms(lambda m: m["frames"][1].pop("file_path")),
         "frame 1: `file_path` must name a file, got None",
@@ -204,10 +196,6 @@ NERFSTUDIO = {
     "no rotation": (
         transforms(pose(0, 1.5)),
         "frame 0 .*cam1.png.: .*: the axes must be a right-handed",
-    ),
-    "long pose": (
-        transforms(lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400)),
-        "frame 0 .*cam1.png.: int too large",
     ),
     "no pose": (
         transforms(lambda m: m["frames"][0].pop("transform_matrix")),
@@ -247,11 +235,6 @@ DYNAMIC3DGS = {
     "broken points": (truncated("init_pt_cld.npz"), "init_pt_cld.npz: expected an array `data`"),
 }
 ANIPOSE = {
-    "broken file": (
-        truncated("calibration.toml"),
-        "calibration.toml: expected TOML, got a broken file",
-    ),
-    "pipe": (pipe("calibration.toml"), "expected a calibration"),
     "no pose": (
         replace("calibration.toml", "translation", "translate"),
         r"\[cam_0\]: `translation` must be .* got none",
@@ -263,11 +246,6 @@ ANIPOSE = {
     "three coefficients": (
         replace("calibration.toml", "distortions = [0.0, 0.0, ", "distortions = ["),
         r"\[cam_0\]: `distortions` must be finite numbers \[4\] or \[5\] or \[8\] of at most "
-        r"1e\+12, got",
-    ),
-    "huge distortion": (
-        replace("calibration.toml", "distortions = [0.0", "distortions = [1e300"),
-        r"calibration.toml, table \[cam_0\]: `distortions` must be finite numbers .* of at most "
         r"1e\+12, got",
     ),
     "half a pixel": (

@@ -24,7 +24,7 @@ from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.quick import OPTIONS
 from tests.scenes.captures import colmap
-from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
+from tests.scenes.noise_capture import FRAMES, rig, truncate_clip
 from tests.scenes.recording import write_recording
 
 
@@ -47,21 +47,6 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
     assert [frame["views"]["cam1"]["psnr"] is None for frame in frames] == [False, True, True]
     assert all(frame["psnr"] > 0 for frame in frames)
-
-
-@pytest.mark.slow
-def test_fit__and_eval_use_the_same_timestamps(capture, tmp_path, run):
-    lengthen_clip(capture)
-    out = tmp_path / "out"
-    options = ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
-    assert run("info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
-    assert run("fit", capture, out, *options, *OPTIONS)[0] == 0
-    record = json.loads((out / "capture.json").read_text())
-    assert (record["frames"], record["reading"]["offset"]) == (2, {"cam1": -1, "cam2": 1})
-    assert [camera["first_frame"] for camera in record["cameras"]] == [1, 0, 2]
-    assert run("eval", out, "--json", tmp_path / "eval.json")[0] == 0
-    result = json.loads((tmp_path / "eval.json").read_text())
-    assert (result["complete"], result["num_frames"]) == (True, 2)
 
 
 def before_frame_2(monkeypatch, action):

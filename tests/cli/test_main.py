@@ -2,7 +2,6 @@
 each.
 """
 
-import json
 import os
 import re
 import subprocess
@@ -15,7 +14,7 @@ from morgs_mi.codec.container import StreamWriter
 from tests.cli.commands import assert_one_sentence, assert_refused
 from tests.core.test_files import tree
 from tests.quick import OPTIONS
-from tests.scenes.noise_capture import lengthen_clip, rig
+from tests.scenes.noise_capture import rig
 
 
 def test_main__names_a_missing_capture(tmp_path, run):
@@ -23,29 +22,6 @@ def test_main__names_a_missing_capture(tmp_path, run):
     for args in (("info", path), ("fit", path, tmp_path / "out", *OPTIONS)):
         assert_refused(run(*args), "expected a capture folder", str(path))
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_main__leaves_cameras_out(capture, tmp_path, run):
-    lengthen_clip(capture)
-    assert_refused(
-        run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --exclude."
-    )
-    assert_refused(
-        run("fit", capture, tmp_path / "out", *OPTIONS),
-        "rames 3, those that all clips cover with --trim",
-    )
-    (capture / "cam2.mkv").write_bytes(b"")
-    status, out, _ = run("info", capture, "--exclude", "cam2")
-    assert (status, "cam2" in out, "3 frames" in out) == (0, False, True)
-    assert run("fit", capture, tmp_path / "out", *OPTIONS, "--exclude", "cam2")[0] == 0
-    assert run("fit", capture, tmp_path / "out", *OPTIONS, "--exclude", "cam2", "--resume")[0] == 0
-    status, out, _ = run("eval", tmp_path / "out", "--json", "-")
-    assert (status, list(json.loads(out)["views"])) == (0, ["cam0", "cam1"])
-    assert_refused(
-        run("info", capture, "--exclude", "cam7"),
-        "--exclude must name cameras of cam0, cam1, cam2, got cam7.",
-    )
 
 
 @pytest.mark.parametrize(

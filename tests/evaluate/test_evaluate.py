@@ -35,6 +35,14 @@ from tests.scenes.moving_splats import (
 from tests.scenes.tiny_network import squared_difference
 
 
+def evaluated(clip, tmp_path, *packets):
+    """Return the evaluation of a stream of packets, with the first view held out."""
+    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
+        for packet in packets:
+            writer.write(packet)
+    return evaluate_stream(tmp_path / "s.morgs", clip / "capture")
+
+
 def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip):
     result = evaluate_stream(fitted_clip)
     assert result.held_out
@@ -111,11 +119,9 @@ def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(fitted
 def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(fitted_clip, tmp_path):
     """A keyframe has no motion error. The error of zero motion is the true motion."""
     state = decode(None, keyframe_packet(moved(1), 0, CAMERAS, EXACT))
-    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
-        writer.write(reemitted_keyframe(state))
-        writer.write(residual_packet(state, state.gaussians))
-        writer.write(keyframe_packet(moved(1), 2, CAMERAS, EXACT))
-    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    still = residual_packet(state, state.gaussians)
+    again = keyframe_packet(moved(1), 2, CAMERAS, EXACT)
+    result = evaluated(fitted_clip, tmp_path, reemitted_keyframe(state), still, again)
     scores = [row.scores for row in result.frames]
     assert scores[1].motion_error_moving == pytest.approx(PIXELS)
     assert np.isnan(scores[2].motion_error)
@@ -130,12 +136,9 @@ def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
     """
     state = decode(None, keyframe_packet(moved(0), 0, CAMERAS, EXACT))
     moved_gaussians = moved(1).select([1, 2, 3, 4, 0])
-    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
-        writer.write(reemitted_keyframe(state))
-        writer.write(
-            residual_packet(state, moved_gaussians, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT)
-        )
-    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").motion_3d
+    rows = np.array([1, 2, 3, 4, -1])
+    change = residual_packet(state, moved_gaussians, rows, CAMERAS, EXACT)
+    result = evaluated(fitted_clip, tmp_path, reemitted_keyframe(state), change).motion_3d
     assert 0 < result.num_gaussians <= 4
     assert result.relative_error < 1e-3
 
@@ -154,9 +157,7 @@ def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip, tmp_pat
 def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(fitted_clip, tmp_path):
     bright = moved(0).sh_coeffs + 0.5 / SH_C0
     darker = replace(moved(0), sh_coeffs=0.9 * bright - 0.5 / SH_C0)
-    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
-        writer.write(keyframe_packet(darker, 0, CAMERAS, EXACT))
-    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    result = evaluated(fitted_clip, tmp_path, keyframe_packet(darker, 0, CAMERAS, EXACT))
     assert result.scores.psnr_matched > result.scores.psnr + 10
     assert f"{result.scores.psnr_matched:.2f} dB after the gain and bias" in " ".join(
         evaluation_summary(result)

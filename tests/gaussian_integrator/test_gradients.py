@@ -19,7 +19,6 @@ from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import to_gaussians
 from tests.scenes.plugin import AOVS, make_mitsuba_scene
-from tests.scenes.surfaces import slopes_of
 
 # Raw attributes, and their derivatives with respect to the activated parameters of a Mitsuba scene.
 ACTIVATED = {
@@ -93,18 +92,6 @@ def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradient
     dr.forward_to(image)
     derivative = np.sum(np.asarray(dr.grad(image), np.float64) * weight)
     assert derivative == pytest.approx(slope, rel=tol.GRADIENT_REL)
-
-
-@pytest.mark.parametrize("name", ["data", "opacities", "sh_coeffs"])
-def test_gaussian_splat__backward_agrees_with_central_differences(raw, name):
-    gradient, slope = slopes_of(
-        make_mitsuba_scene(to_gaussians(raw)),
-        f"gaussians.{name}",
-        1e-3,
-        lambda image: dr.sum(dr.square(image), axis=None),
-        spp=1,
-    )
-    assert slope == pytest.approx(gradient, rel=tol.CENTRAL_DIFFERENCE_REL)
 
 
 def test_gaussian_splat__gradient_of_the_sensors_pose(raw):

@@ -6,8 +6,6 @@ import numpy as np
 
 from morgs_mi import Camera
 
-Point = tuple[float, float, float]
-
 # Four origins in front of the scene.
 QUAD = tuple((x, y, -3.5) for x in (-0.9, 0.9) for y in (-0.6, 0.6))
 

@@ -34,11 +34,6 @@ def write_capture(path):
     return path
 
 
-def lengthen_clip(path):
-    """Give cam2 two more frames."""
-    write_video(path / "cam2.mkv", clip(FRAMES + 2), 25)
-
-
 def truncate_clip(path):
     """Cut cam1 off after its first frame."""
     data = (path / "cam1.mkv").read_bytes()

@@ -1,9 +1,11 @@
 """A Mitsuba scene of Gaussians with the integrator `gaussian_splat`."""
 
 import mitsuba as mi
+import numpy as np
 
 from morgs_mi import ellipsoids
 from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.gaussians import to_gaussians
 
 AOVS = "motion,confidence,depth"
 
@@ -20,3 +22,7 @@ def make_mitsuba_scene(gaussians, film=None, sensor=None, **props):
             "integrator": {"type": "gaussian_splat", **props},
         }
     )
+
+
+def plugin_image(raw, film=None, sensor=None, **props):
+    return np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), film, sensor, **props)))

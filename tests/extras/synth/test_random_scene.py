@@ -1,15 +1,12 @@
 """Random scenes: what the seed draws, without rendering, and one small clip."""
 
-import json
 from itertools import combinations
 
 import numpy as np
 import pytest
 
-from morgs_mi.capture.truth import load_truth
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
-from morgs_mi.testing import assert_close
 
 # Not tests.scenes.
 from scenes.random import draw_scene  # pyright: ignore[reportMissingImports]
@@ -67,27 +64,6 @@ def test_draw_scene__speed_is_that_of_the_fastest_point_in_the_held_out_view(sce
             # A frame covers up to a ninth of an oscillation, over which the mean speed is below the
             # peak.
             assert 0.7 * body.speed <= fastest <= 1.02 * body.speed, name
-
-
-@pytest.mark.slow
-def test_synthesize__records_the_random_scene_of_a_seed(clip):
-    scene = draw_scene(1)
-    settings = json.loads((clip / "capture.json").read_text())
-    names = settings["objects"]
-    assert names[4:] == list(scene.bodies)
-    assert (settings["scene"], settings["spp"]) == ("random", scene.recording.spp)
-    assert settings["num_cameras"] == scene.recording.num_cameras
-    assert_close(settings["noise"], scene.recording.noise, rtol=1e-9)
-    camera = scene.rig.cameras(scene.recording.num_cameras, 64, 48)[0]
-    truth = load_truth(clip / "truth", "cam00", 1)
-    y, x = np.mgrid[:48, :64] + 0.5
-    points = camera.unproject(np.stack([x, y], axis=-1), truth.depth)
-    for name, body in scene.bodies.items():
-        mask = truth.ids == names.index(name)
-        assert mask.sum() > 3
-        assert (points[mask] > body.bounds[0] - 0.01).all()
-        assert (points[mask] < body.bounds[1] + 0.01).all()
-        assert (truth.mask[mask] == (body.motion != "static")).all()
 
 
 @pytest.mark.slow
