@@ -159,14 +159,8 @@ def with_table(table, rest=b""):
         (sealed(b"", kind=7), r"1 \(keyframe\) or 2 \(residual\), got 7"),
         (sealed(b"\xff\xff\xff\xff"), "table of arrays is broken"),
         (with_table(b"[" * 60_000), "table of arrays is broken .*recursion"),
-        (with_table(b'{"a": 1}'), "table of arrays is broken"),
         (with_table(b'[[["a"], "uint8", [1]]]', bytes(1)), r"is declared as uint8 \[1\]"),
-        (with_table(b'[["a", {"x": 1}, [1]]]', bytes(1)), "table of arrays is broken"),
         (with_table(b'[["a", "uint8", [1.0]]]', bytes(1)), r"`a` is declared as uint8 \[1.0\]"),
-        (
-            with_table(b'[["a", "uint8", [1,1,1,1,1,1,1,1,1]]]', bytes(1)),
-            r"`a` is declared as uint8 \[1, 1",
-        ),
         (
             with_table(b'[["a", "uint8", [1]], ["a", "uint8", [1]]]', bytes(2)),
             r"`a` is declared as uint8 \[1\]",
@@ -174,7 +168,6 @@ def with_table(table, rest=b""):
         (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, .* got NaN"),
         (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
         (with_table(b'[["a", "object", [1]]]', bytes(8)), "table of arrays is broken"),
-        (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (
             with_table(b'[["a", "float32", [1000000000000]]]', bytes(8)),
             "table of arrays is broken",

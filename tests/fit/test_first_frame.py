@@ -37,14 +37,14 @@ def images():
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """A list to which every step of a fit adds the Gaussians that it renders."""
+    """A list to which every step of a fit adds the Gaussians and the width that it renders."""
     steps = []
     render = ActiveView.render
 
     def spy(view, gaussians, *channels, **more):
         # Rounds of density control render without gradients.
         if dr.grad_enabled(gaussians.sh_coeffs):
-            steps.append(gaussians.detached())
+            steps.append((gaussians.detached(), view.camera.width))
         return render(view, gaussians, *channels, **more)
 
     monkeypatch.setattr(ActiveView, "render", spy)
@@ -69,9 +69,8 @@ DARK = dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
 
 def lengths(drawn, first_frame):
     """Return the length of each step of the colours."""
-    colors = np.array(
-        [np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, first_frame.gaussians]]
-    )
+    shown = [*(gaussians for gaussians, _ in drawn), first_frame.gaussians]
+    colors = np.array([np.asarray(gaussians.sh_coeffs) for gaussians in shown])
     return np.median(np.diff(colors, axis=0), axis=(1, 2, 3))
 
 
@@ -112,7 +111,7 @@ def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
     result = fit(
         images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates)
     )
-    shift = np.abs(np.asarray(result.gaussians.means) - np.asarray(drawn[0].means))
+    shift = np.abs(np.asarray(result.gaussians.means) - np.asarray(drawn[0][0].means))
     # The extent is 3. The first step of Adam has the length of the rate where there is a gradient.
     assert np.median(shift) == pytest.approx(3e-3, rel=1e-3)
 
@@ -126,7 +125,7 @@ def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkey
     monkeypatch.setattr("morgs_mi.fit.first_frame.BAND", 0.15)
     config = dataclasses.replace(CONFIG, sh_degree=3, first_frame_steps=20)
     result = fit(images, ball(50, sh_degree=3), config)
-    assert [gaussians.sh_degree for gaussians in drawn] == 3 * [0] + 3 * [1] + 3 * [2] + 11 * [3]
+    assert [gaussians.sh_degree for gaussians, _ in drawn] == 3 * [0] + 3 * [1] + 3 * [2] + 11 * [3]
     bands = np.abs(np.asarray(result.gaussians.sh_coeffs)).mean(axis=(0, 2))
     assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
 
@@ -146,7 +145,7 @@ def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_gi
         sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3)
     )
     result = fit(images, ball(60), config)
-    counts = [len(gaussians) for gaussians in drawn]
+    counts = [len(gaussians) for gaussians, _ in drawn]
     assert (
         [step for step, (a, b) in enumerate(pairwise(counts), 1) if a != b]
         == density_rounds(config)
@@ -180,24 +179,15 @@ def test_fit_first_frame__prunes_what_is_invisible(images):
     assert len(fit(images, start, config).gaussians) == 50
 
 
-def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images, monkeypatch):
+def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(
+    images, drawn, monkeypatch
+):
     monkeypatch.setattr("morgs_mi.fit.view.COARSE_WIDTH", 32)
     monkeypatch.setattr("morgs_mi.fit.view.MIN_SIDE", 24)
-    widths = []
-    render = ActiveView.render
-
-    def spy(view, gaussians, *channels, **more):
-        if dr.grad_enabled(gaussians.sh_coeffs):
-            widths.append(view.camera.width)
-        return render(view, gaussians, *channels, **more)
-
-    monkeypatch.setattr(ActiveView, "render", spy)
     config = dataclasses.replace(CONFIG, first_frame_steps=20, density=DensityConfig(rounds=3))
     fit(images, ball(60), config)
-    assert widths == 10 * [32] + 10 * [64]
-    widths.clear()
     fit(images, ball(60), CONFIG)
-    assert widths == 8 * [64]
+    assert [width for _, width in drawn] == 10 * [32] + 18 * [64]
 
 
 # ---- images, masks and losses
@@ -251,7 +241,7 @@ def test_fit_first_frame__fits_views_of_different_sizes(images):
 
 def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_result(images, drawn):
     result = fit(images, ball(80), dataclasses.replace(CONFIG, dropout=0.25))
-    left_out = np.array([np.asarray(gaussians.opacities) < 1e-6 for gaussians in drawn])
+    left_out = np.array([np.asarray(gaussians.opacities) < 1e-6 for gaussians, _ in drawn])
     assert left_out.mean() == pytest.approx(0.25, abs=0.05)
     assert len(np.unique(left_out, axis=0)) == len(drawn)  # others in each step
     assert np.asarray(result.gaussians.opacities).min() > 0.01

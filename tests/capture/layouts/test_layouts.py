@@ -561,19 +561,11 @@ def test_metadata__describes_how_frames_were_read(tmp_path):
     path = layouts.nerfstudio(tmp_path / "a")
     metadata = load_capture(path, downscale=2, test_view=1, max_frames=3).metadata()
     assert json.loads(json.dumps(metadata)) == metadata
-    assert (
-        metadata["filter"],
-        metadata["downscale"],
-        metadata["test_view"],
-        metadata["frames"],
-    ) == ("area", 2, [1], 3)
-    assert (metadata["layout"], metadata["fps"], metadata["points"]) == ("Nerfstudio", FPS, 0)
+    expected = {"layout": "Nerfstudio", "filter": "area", "downscale": 2, "frames": 3}
+    assert metadata.items() >= expected.items()
     view = metadata["cameras"][2]
-    assert (view["name"], view["recorded_size"], view["size"]) == (
-        "cam10",
-        [WIDTH, HEIGHT],
-        [WIDTH // 2, HEIGHT // 2],
-    )
-    assert (view["lens"], view["undistortion"]) == ("OPENCV", "cubic, same intrinsics")
+    expected = {"name": "cam10", "lens": "OPENCV", "recorded_size": [WIDTH, HEIGHT]}
+    assert view.items() >= expected.items()
+    assert view["size"] == [WIDTH // 2, HEIGHT // 2]
     assert 0.5 < view["valid_share"] <= 1
     assert load_capture(path).metadata()["filter"] == "none"
