@@ -157,17 +157,21 @@ def test_box_around__adds_margins():
     assert box_around(change) == (slice(26, 84), slice(40, 160))
 
 
+def draw_moving_patch(image, next_image, shift, rng):
+    patch = cv2.resize(
+        rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC
+    )
+    image[34:66, 54:86] = patch
+    next_image[34:66, 54 + shift : 86 + shift] = patch
+
+
 @pytest.mark.parametrize("with_masks", [False, True])
 def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_masks):
     """Inside a patch that moves by 4 px."""
     rng = np.random.default_rng(4)
     image = noisy_image(rng)
     next_image = noisy_image(rng)
-    patch = cv2.resize(
-        rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC
-    )
-    image[34:66, 54:86] = patch
-    next_image[34:66, 58:90] = patch
+    draw_moving_patch(image, next_image, 4, rng)
     box = box_around(changed(image, next_image))
     masks = "grabcut" if with_masks else None
     observations = [
@@ -188,11 +192,7 @@ def test_observe_key_views__what_has_not_changed_has_not_moved():
     """Flow bleeds over the edges of a patch that moves by 6 px before a plain wall."""
     rng = np.random.default_rng(9)
     image, next_image = np.full((2, H, W, 3), 120, np.uint8)
-    patch = cv2.resize(
-        rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC
-    )
-    image[34:66, 54:86] = patch
-    next_image[34:66, 60:92] = patch
+    draw_moving_patch(image, next_image, 6, rng)
     region = moving_region(changed(image, next_image))
     observed = {
         name: observe_key_views({0: FramePair(next_image, image, region=r)})[0]

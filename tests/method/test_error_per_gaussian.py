@@ -18,17 +18,20 @@ from tests.scenes.gaussians import isotropic, random_sheet
 N = 300
 
 
+def sheet(rng, n=N, depth=0.6):
+    colors = rng.uniform(-1.5, 1.5, (n, 1, 3))
+    return isotropic(random_sheet(rng, n, 1.2, depth), 0.06, 0.8, colors)
+
+
 @pytest.fixture(scope="module")
 def scene():
     """A wall; the whole of one view and a part of another one, whose target is masked."""
     rng = np.random.default_rng(0)
-    wall = isotropic(random_sheet(rng, N, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (N, 1, 3)))
+    wall = sheet(rng)
     cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 80, 60)
     part = np.zeros((60, 80), bool)
     part[20:50, 10:60] = True
-    static = isotropic(
-        random_sheet(rng, 40, 1.2, 0.3), 0.06, 0.8, rng.uniform(-1.5, 1.5, (40, 1, 3))
-    )
+    static = sheet(rng, 40, 0.3)
     views = [
         ActiveView(cameras[0]),
         make_active_view(cameras[1], Region.of(part), static, ("color",), RenderConfig()),
@@ -62,7 +65,7 @@ def test_error_per_gaussian__is_what_back_projection_gives(scene, monkeypatch):
 def test_error_per_gaussian__ignores_noise():
     """Of an image with noise, errors count only where something else is wrong."""
     rng = np.random.default_rng(1)
-    wall = isotropic(random_sheet(rng, N, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (N, 1, 3)))
+    wall = sheet(rng)
     view = ActiveView(look_at_cameras([(0, 0.3, -3)], 45, 80, 60)[0])
     image = np.asarray(view.render(wall).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(
         np.float32

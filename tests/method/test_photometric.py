@@ -109,15 +109,14 @@ def test_refine_start__follows_a_change_of_light(scene):
     bright_targets = targets(brighter, views)
     followed = with_colors(gaussians, color_change(gaussians, views, bright_targets)[:, None])
     differences = [
-        np.abs(bright_targets[v].difference(view.render(followed).color)).mean()
-        for v, view in views.items()
-    ]
-    there = [
-        np.abs(bright_targets[v].difference(view.render(gaussians).color)).mean()
-        for v, view in views.items()
+        [
+            np.abs(target.difference(views[v].render(shown).color)).mean()
+            for v, target in bright_targets.items()
+        ]
+        for shown in (followed, gaussians)
     ]
     # The rest is at the border, and from the weight of ten pixels.
-    assert max(differences) < 0.5 * min(there)
+    assert max(differences[0]) < 0.5 * min(differences[1])
 
 
 def test_refine_start__trusts_few_pixels_less(scene):

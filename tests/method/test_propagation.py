@@ -61,6 +61,13 @@ def found(lift, moves):
     return right[moves].mean(), right[~moves].mean()
 
 
+def lift_of(mask):
+    """Return the true motion of some Gaussians."""
+    return MotionStart(
+        (SHIFT * mask[:, None]).astype(np.float32), np.where(mask, 2, -2).astype(np.float32)
+    )
+
+
 def test_propagate_motion__continues_motion_without_flow(scene):
     moves = scene[1]
     lift = start(scene, still(460), SHIFT * moves[:, None])
@@ -81,21 +88,14 @@ def test_propagate_motion__ends_motion_that_has_stopped(scene):
 
 def test_propagate_motion__spreads_to_neighbours(scene):
     moves = scene[1]
-    mask = moves & (np.arange(460) % 3 == 0)
-    lift = MotionStart(
-        (SHIFT * mask[:, None]).astype(np.float32), np.where(mask, 2, -2).astype(np.float32)
-    )
-    hit, static = found(start(scene, lift), moves)
+    hit, static = found(start(scene, lift_of(moves & (np.arange(460) % 3 == 0))), moves)
     assert hit > 0.96  # a third to begin with
     assert static > 0.99
 
 
 def test_propagate_motion__keeps_true_motion(scene):
     moves = scene[1]
-    lift = MotionStart(
-        (SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32)
-    )
-    result = start(scene, lift, -SHIFT * moves[:, None])
+    result = start(scene, lift_of(moves), -SHIFT * moves[:, None])
     assert found(result, moves)[0] > 0.96
 
 
