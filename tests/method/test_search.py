@@ -53,21 +53,24 @@ def moved(gaussians, shift=SHIFT):
     return replace(gaussians, means=np.asarray(gaussians.means) + shift * MOVES[:, None])
 
 
-def still():
-    return MotionStart(np.zeros((ROD + WALL, 3), np.float32), np.full(ROD + WALL, -2, np.float32))
-
-
-def searched(gaussians, start, views, visible, config=CONFIG):
-    return search_motion(
-        MotionProblem(gaussians, views, visible, np.random.default_rng(0)), start, config
+def start_of(shift=0 * SHIFT, logit=-2):
+    """Return a motion and a confidence of the rod."""
+    return MotionStart(
+        (shift * MOVES[:, None]).astype(np.float32), np.where(MOVES, logit, -2).astype(np.float32)
     )
+
+
+def searched(scene, start, visible=None, config=CONFIG):
+    """Search in the images of the Gaussians that are visible: by default the moved ones."""
+    gaussians, views = scene
+    images = targets(moved(gaussians) if visible is None else visible, views)
+    problem = MotionProblem(gaussians, views, images, np.random.default_rng(0))
+    return search_motion(problem, start, config)
 
 
 @pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])
 def test_search_motion__finds_a_fast_thin_part(scene, shift):
-    gaussians, views = scene
-    images = targets(moved(gaussians, shift), views)
-    motion = searched(gaussians, still(), views, images)
+    motion = searched(scene, start_of(), moved(scene[0], shift))
     distance = np.linalg.norm(motion.displacement[MOVES] - shift, axis=1)
     assert np.all(distance < 0.1 * np.linalg.norm(shift))
     assert not motion.displacement[~MOVES].any()
@@ -76,11 +79,7 @@ def test_search_motion__finds_a_fast_thin_part(scene, shift):
 
 
 def test_search_motion__corrects_a_wrong_start(scene):
-    gaussians, views = scene
-    wrong = MotionStart(
-        (-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32)
-    )
-    motion = searched(gaussians, wrong, views, targets(moved(gaussians), views))
+    motion = searched(scene, start_of(-SHIFT, 1))
     assert np.all(
         np.linalg.norm(motion.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT)
     )
@@ -88,31 +87,22 @@ def test_search_motion__corrects_a_wrong_start(scene):
 
 
 def test_search_motion__keeps_a_start_that_explains_the_images(scene):
-    gaussians, views = scene
-    right = MotionStart(
-        (SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32)
-    )
-    assert searched(gaussians, right, views, targets(moved(gaussians), views)) is right
-    assert searched(gaussians, right, {}, {}) is right
+    right = start_of(SHIFT, 1)
+    assert searched(scene, right) is right
+    assert searched((scene[0], {}), right) is right
 
 
 def test_search_motion__keeps_a_part_that_vanished(scene):
-    gaussians, views = scene
-    gone = gaussians.select(np.flatnonzero(~MOVES))
-    start = still()
-    assert searched(gaussians, start, views, targets(gone, views)) is start
+    start = start_of()
+    assert searched(scene, start, scene[0].select(np.flatnonzero(~MOVES))) is start
 
 
 @pytest.mark.parametrize(
     "setting", [{"reach": 0.03}, {"max_parts": 0}], ids=lambda setting: next(iter(setting))
 )
 def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
-    gaussians, views = scene
-    start = still()
-    assert (
-        searched(gaussians, start, views, targets(moved(gaussians), views), SearchConfig(**setting))
-        is start
-    )
+    start = start_of()
+    assert searched(scene, start, config=SearchConfig(**setting)) is start
 
 
 @pytest.mark.parametrize(
@@ -126,15 +116,13 @@ def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
     ],
 )
 def test_search_motion__each_threshold_can_prevent_a_finding(scene, monkeypatch, threshold, value):
-    gaussians, views = scene
-    start = still()
+    start = start_of()
     monkeypatch.setattr(f"morgs_mi.method.search.{threshold}", value)
-    assert searched(gaussians, start, views, targets(moved(gaussians), views)) is start
+    assert searched(scene, start) is start
 
 
 def test_search_motion__gives_a_low_confidence_to_what_is_found(scene):
-    gaussians, views = scene
-    motion = searched(gaussians, still(), views, targets(moved(gaussians), views))
+    motion = searched(scene, start_of())
     assert np.allclose(motion.logit_confidence[MOVES], 0.3)
 
 
