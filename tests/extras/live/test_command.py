@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.extras.live import command as module
-from morgs_mi.extras.live.command import Live, LiveSettings, _Lines
+from morgs_mi.extras.live.command import Live, LiveSettings, _Lines, _summary
 from morgs_mi.extras.live.fit_live import LiveFrame
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.streams import open_stream
@@ -107,3 +107,16 @@ def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch):
         "Frame 0: 0.0 s after the first, latency 0.25 s, 0 frames dropped, skew 4 ms.",
         "Frame 3: 1.2 s after the first, latency 0.25 s, 9 frames dropped, skew 4 ms.",
     ]
+
+
+def test_summary__has_means_of_the_later_frames(tmp_path):
+    (tmp_path / "stream.morgs").write_bytes(b"x" * 2_340_000)
+    rows = [
+        LiveFrame(0, 0, 30, 0.001, 0),
+        LiveFrame(1, 31, 0.5, 0.012, 900),
+        LiveFrame(2, 32, 0.7, 0.003, 20),
+    ]
+    assert _summary(tmp_path, rows) == (
+        f"{tmp_path}/stream.morgs: fitted 3 of 923 frames (920 dropped) in 32.0 s, 2.3 MB, 30.0 s "
+        "for the first one, mean latency of the others 0.60 s, largest skew 12 ms."
+    )
