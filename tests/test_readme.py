@@ -2,13 +2,13 @@
 exist.
 """
 
-import json
 import re
 from pathlib import Path
 
 import pytest
 
 from morgs_mi.cli.main import COMMANDS
+from morgs_mi.core.bounded import read_json
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 
@@ -37,7 +37,7 @@ def test_readme__examples_run(example, workplace, monkeypatch):
 
 
 def result(name):
-    return json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
+    return read_json(ROOT / f"benchmarks/results/{name}.json")
 
 
 def test_readme__quotes_the_committed_demo():

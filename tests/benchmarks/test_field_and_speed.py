@@ -1,6 +1,5 @@
 """Motion models of other publications, times, and pictures, at a tiny size."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from benchmarks import ewa, pictures, workloads
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
 from benchmarks.speed import frame_speed, render_speed, splat_files
+from morgs_mi.core.bounded import read_json
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
@@ -29,7 +29,7 @@ def test_frame_speed__measures_a_tiny_scene(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_speed, "SIZES", {"tiny": frame_speed.Size(64, 48, 3, 600, 2)})
     out = tmp_path / "out.json"
     frame_speed.main(frame_speed.Options(out, ("tiny",), epochs=(1,), full=()))
-    for run in json.loads(out.read_text())["tiny"]["runs"].values():
+    for run in read_json(out)["tiny"]["runs"].values():
         assert min(run["seconds"], run["bytes"], run["pixels"], run["psnr"] - 10) > 0
 
 

@@ -1,6 +1,5 @@
 """Reports at a tiny size, and the measures that their claims rest on."""
 
-import json
 from dataclasses import replace
 from importlib import import_module
 from types import SimpleNamespace
@@ -15,6 +14,7 @@ from benchmarks.reports.tracks import track_scores
 from morgs_mi import RenderConfig, SynthConfig, load_capture, synthesize
 from morgs_mi.capture.truth import Tracks, save_tracks
 from morgs_mi.codec.frame_source import FrameState
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.runs.fit_capture import stream_capture
@@ -69,7 +69,7 @@ def test_reports__write_rows(name, clips, tmp_path, monkeypatch):
     report = import_module(f"benchmarks.reports.{name}")
     options = tyro.cli(report.Options, args=args)
     report.main(options) if name == "field" else options.run()
-    result = json.loads(next(tmp_path.glob("*.json")).read_text())
+    result = read_json(next(tmp_path.glob("*.json")))
     assert {"machine", "versions", "commit", "date"} <= result.keys()
     assert any(result.get(key) for key in ("fits", "rows", "clips", "cells"))
 

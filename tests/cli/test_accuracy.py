@@ -1,11 +1,10 @@
 """`morgs-mi accuracy`: table, plot and JSON of a file of Gaussians and of a stream."""
 
-import json
-
 import pytest
 
 from benchmarks.workloads import ball
 from morgs_mi import write_ply
+from morgs_mi.core.bounded import read_json
 from morgs_mi.evaluate import accuracy as module
 from tests.cli.commands import assert_refused
 
@@ -24,10 +23,10 @@ def test_accuracy__writes_plot_and_json_beside_the_file_or_as_named(run, scene, 
     assert status == 0
     assert "1/65280, 1e-06 *" in text
     assert scene.with_name("scene-accuracy.png").read_bytes().startswith(b"\x89PNG")
-    result = json.loads(scene.with_name("scene-accuracy.json").read_text())
+    result = read_json(scene.with_name("scene-accuracy.json"))
     assert result["config"]["alpha_min"] == 1 / 65280
     more = ("--camera", "left", "--tolerance", "1e-8")
     assert run("accuracy", scene, tmp_path / "a.svg", *more)[0] == 0
     assert "<svg" in (tmp_path / "a.svg").read_text()
-    assert json.loads((tmp_path / "a.json").read_text())["config"] is None
+    assert read_json(tmp_path / "a.json")["config"] is None
     assert_refused(run("accuracy", scene, tmp_path / "a.txt"), "suffix of a plot")

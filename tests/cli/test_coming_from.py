@@ -2,7 +2,6 @@
 them.
 """
 
-import json
 import os
 import re
 import shlex
@@ -17,6 +16,7 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
@@ -120,7 +120,7 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(
         assert status == 0, f"{command}\n{error}"
         outputs[rest[0]] = output
         if rest[0] == "fit":
-            frames[rest[2]] = len(json.loads(Path(rest[2], "report.json").read_text())["frames"])
+            frames[rest[2]] = len(read_json(Path(rest[2], "report.json"))["frames"])
     assert [frames.pop(f"out/{name}") for name in ("nerfstudio", "vggt")] == [1, 1]
     assert frames.pop("out/dynamic3dgs") == layouts.COUNT
     assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "3dgstream")}

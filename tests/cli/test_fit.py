@@ -1,6 +1,5 @@
 """`morgs-mi fit`: options, interruption, a full disk, and continuing."""
 
-import json
 import shlex
 import shutil
 import signal
@@ -16,6 +15,7 @@ import pytest
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.bounded import read_json
 from morgs_mi.io.video import VideoReader
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.cluster.chunks import ChunkedRun
@@ -40,11 +40,11 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
         VideoReader, "open", lambda path: replace(opened(copies.get(str(path), path)), path=path)
     )
     assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 0
-    frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    frames = read_json(tmp_path / "out" / "report.json")["frames"]
     assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]
     assert "cam1.mkv: frame 1 of 3 cannot be decoded" in frames[2]["status"]
     assert run("eval", tmp_path / "out", "--json", tmp_path / "eval.json")[0] == 0
-    frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
+    frames = read_json(tmp_path / "eval.json")["frames"]
     assert [frame["views"]["cam1"]["psnr"] is None for frame in frames] == [False, True, True]
     assert all(frame["psnr"] > 0 for frame in frames)
 
@@ -196,7 +196,7 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     assert error.splitlines()[-1] == stands  # after lines of progress, on a slow machine
     status, _, error = run("eval", tmp_path / "my out", "--json", tmp_path / "eval.json")
     assert (status, "the fit was not finished" in error) == (0, True)
-    assert not json.loads((tmp_path / "eval.json").read_text())["complete"]
+    assert not read_json(tmp_path / "eval.json")["complete"]
 
 
 def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
@@ -262,7 +262,7 @@ def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_c
     for image in clip.glob("cam*/0000.png"):
         write_png(image, np.zeros((24, 32, 3), np.uint8))
     status, output, _ = run("fit", clip, tmp_path / "out", *OPTIONS, "--hold-out", "none")
-    (first, second) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    (first, second) = read_json(tmp_path / "out" / "report.json")["frames"]
     assert (status, second["status"]) == (0, "ok")
     assert "the image is black; cut such frames off" in first["status"]
     assert (

@@ -2,7 +2,6 @@
 of these.
 """
 
-import json
 import re
 import shlex
 import shutil
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from morgs_mi.core.bounded import read_json
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 
@@ -49,7 +49,7 @@ def test_commands_for_public_recordings__give_scores_of_camera_0(tmp_path, run, 
         status, _, error = run(*shlex.split(smaller))
         assert status == 0, error
     for name, held_out in (("cut_roasted_beef", "cam00"), ("discussion", "cam_0")):
-        scores = json.loads((tmp_path / "out" / name / "eval.json").read_text())
+        scores = read_json(tmp_path / "out" / name / "eval.json")
         assert scores["held_out"] is True
         assert [*scores["views"]] == [held_out]
         assert scores["psnr"]["mean"] > 25

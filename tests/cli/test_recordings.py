@@ -4,11 +4,12 @@ folder that holds them.
 MORGS_MI_RECORDINGS=FOLDER pytest -m slow tests/cli/test_recordings.py
 """
 
-import json
 import os
 from pathlib import Path
 
 import pytest
+
+from morgs_mi.core.bounded import read_json
 
 FOLDER = os.environ.get("MORGS_MI_RECORDINGS")
 CAPTURES = sorted(path for path in Path(FOLDER).iterdir() if path.is_dir()) if FOLDER else []
@@ -31,6 +32,6 @@ def test_recording__is_fitted_evaluated_and_exported_by_default(capture, tmp_pat
     ):
         status, _, error = run(*command)
         assert status == 0, f"{command}\n{error}"
-    scores = json.loads((tmp_path / "eval.json").read_text())
+    scores = read_json(tmp_path / "eval.json")
     assert scores["num_frames"] == FRAMES
     assert scores["psnr"]["mean"] > 25, "of the training views, or of one between many"

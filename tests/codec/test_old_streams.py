@@ -6,7 +6,6 @@ again.
 """
 
 import hashlib
-import json
 import re
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 from morgs_mi.codec.container import VERSION
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.bounded import read_json
 
 STREAMS = Path(__file__).parent / "streams"
 PROMISES = (Path(__file__).parents[2] / "docs" / "promises.md").read_text(encoding="utf-8")
@@ -41,7 +41,7 @@ def summary(path):
 
 @pytest.mark.parametrize("path", sorted(STREAMS.glob("*.morgs")), ids=lambda path: path.stem)
 def test_old_streams__decode_to_the_same_numbers(path):
-    expected = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    expected = read_json(path.with_suffix(".json"))
     # The learned part of the motion is no longer read.
     for row in expected:
         row.pop("offset", None)

@@ -7,7 +7,6 @@ its folder:
 MORGS_MI_BASKETBALL=FOLDER pytest -m slow tests/runs/test_basketball.py
 """
 
-import json
 import os
 import shutil
 
@@ -16,6 +15,7 @@ import pytest
 
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.bounded import read_json
 
 FOLDER = os.environ.get("MORGS_MI_BASKETBALL")
 FRAMES = 30
@@ -38,13 +38,13 @@ def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
     ]
     assert main(command) == 0
     assert main(["eval", str(out), "--json", str(tmp_path / "eval.json")]) == 0
-    result = json.loads((tmp_path / "eval.json").read_text())
+    result = read_json(tmp_path / "eval.json")
     assert set(result["views"]) == {"0", "10", "15", "30"}
     # The committed run, docs/experiments/real.md, less the spread of fits.
     assert min(scores["psnr"] for scores in result["views"].values()) > 24
     assert result["frames"][0]["psnr"] > 28
     assert result["frames"][-1]["psnr"] > 27
-    rows = json.loads((out / "report.json").read_text())["frames"]
+    rows = read_json(out / "report.json")["frames"]
     assert np.mean([row["active"]["gaussians"] for row in rows[1:]]) < 0.35
     assert np.mean([row["num_bytes"] for row in rows[1:]]) < 270e3
 

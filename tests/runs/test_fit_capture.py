@@ -22,6 +22,8 @@ from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import PROVISIONAL
+from morgs_mi.core.bounded import read_json
+from morgs_mi.core.fit_names import PROVISIONAL
 from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next
@@ -52,7 +54,7 @@ def stream_of(out):
 
 def report_of(out):
     """Return the report without what differs between any two runs."""
-    report = json.loads((out / "report.json").read_text())
+    report = read_json(out / "report.json")
     return report | {
         "frames": [
             {name: value for name, value in row.items() if name not in ("seconds", "memory")}
@@ -198,7 +200,7 @@ def test_stream_capture__replaces_an_earlier_fit_together(whole, tmp_path):
 
     def spy(loop, *args):
         if frame := loop.state.frame:
-            metadata = json.loads((out / "capture.json").read_text())
+            metadata = read_json(out / "capture.json")
             rows = report_of(out)["frames"]
             held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
             frames.append(
@@ -273,7 +275,7 @@ def cuts(whole):
 
 @pytest.mark.slow
 def test_stream_capture__resumed_from_any_cut_is_the_same(whole, tmp_path):
-    report = json.loads((whole / "report.json").read_text())
+    report = read_json(whole / "report.json")
     for k, at in enumerate(cuts(whole)):
         out = interrupted(whole, tmp_path / f"{at}", at)
         count = len(played(out / "stream.morgs"))
@@ -438,7 +440,7 @@ def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole, tmp_pat
     assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(
         coded_frames(reader)
     )
-    assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
+    assert read_json(out / "capture.json")["capture"] == str(Path("noise").resolve())
 
 
 def test_stream_capture__resumes_beside_a_hostile_description(whole, tmp_path):

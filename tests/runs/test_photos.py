@@ -6,7 +6,6 @@ names their folder, with a folder for each set:
 MORGS_MI_PHOTOS=FOLDER pytest -m slow tests/runs/test_photos.py
 """
 
-import json
 import os
 import shutil
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 from benchmarks.pages.results import committed
 from benchmarks.reports import real
 from morgs_mi.cli.main import main
+from morgs_mi.core.bounded import read_json
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.
@@ -42,7 +42,7 @@ def test_photos__are_calibrated_and_reach_the_committed_quality(name, tmp_path):
             shutil.copy(path, photos)
     assert main(["calibrate", str(photos), "--shared-intrinsics"]) == 0
     real.Options(json=tmp_path / "out.json", captures=(photos,)).run()
-    (row,) = json.loads((tmp_path / "out.json").read_text())["fits"]
+    (row,) = read_json(tmp_path / "out.json")["fits"]
     assert row["views"] + row["held_out_views"] == count, "every photo is registered"
     assert row["principal_points"] == points
     fits = [

@@ -20,6 +20,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.testing import assert_close
@@ -194,7 +195,7 @@ def test_load_capture__names_what_reads_a_fit(tmp_path):
 
 
 def edit(path, change, name="transforms.json"):
-    meta = json.loads((path / name).read_text())
+    meta = read_json(path / name)
     change(meta)
     (path / name).write_text(json.dumps(meta))
 
@@ -229,7 +230,7 @@ def test_dynamic3dgs__reads_cameras(tmp_path):
 
 def split_meta(path, **cameras):
     """Keep the `cameras` of `train_meta.json` in the files of these names."""
-    meta = json.loads((path / "train_meta.json").read_text())
+    meta = read_json(path / "train_meta.json")
     for name, members in cameras.items():
         picks = [[row.index(i) for i in members] for row in meta["cam_id"]]
         lists = {

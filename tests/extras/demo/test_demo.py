@@ -1,6 +1,5 @@
 """The demonstration at a small size: its files exist and are consistent."""
 
-import json
 from dataclasses import replace
 
 import cv2
@@ -8,6 +7,7 @@ import pytest
 
 from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.files import locked_folder
 from morgs_mi.extras.demo.demo import DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.extras.synth.synth_config import SynthConfig
@@ -40,7 +40,7 @@ def out(tmp_path_factory):
 
 
 def test_run_demo__report_is_consistent(out):
-    report = json.loads((out / "report.json").read_text())
+    report = read_json(out / "report.json")
     assert (report["full"]["num_frames"], report["plain"]["num_frames"]) == (4, 3)
     comparison = report["comparison"]
     assert comparison["frames"] == [1, 2], (

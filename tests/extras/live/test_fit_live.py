@@ -2,7 +2,6 @@
 that are not.
 """
 
-import json
 from collections import deque
 from dataclasses import replace
 from unittest.mock import Mock
@@ -13,6 +12,7 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.png import png_bytes
 from morgs_mi.extras.live import sources as module
 from morgs_mi.extras.live.fit_live import fit_live
@@ -75,7 +75,7 @@ def test_fit_live__follows_videos_at_their_speed(tmp_path, rig, videos):
         assert row.skew <= 0.5
     assert sum(row.dropped for row in rows) > 0, "the fit is slower than the clip"
     assert sum(row.dropped + 1 for row in rows[1:]) <= FPS * rows[-1].time + 4
-    report = json.loads((out / "report.json").read_text())
+    report = read_json(out / "report.json")
     assert [row["dropped"] for row in report["live"]] == [row.dropped for row in rows]
     assert open_stream(out).closed()
     recorded = list(load_capture(out / "capture").images(2))

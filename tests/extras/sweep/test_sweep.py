@@ -2,7 +2,6 @@
 there are not made again. Parts are left out alone and together.
 """
 
-import json
 import tomllib
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.config import apply_values, config_toml, read_config
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.extras.sweep import sweep as module
@@ -59,7 +59,7 @@ def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path,
         assert len(curve) == 3
         assert seconds == sorted(seconds)
 
-    document = json.loads((out / "sweep.json").read_text())
+    document = read_json(out / "sweep.json")
     assert document["scores"][3][1][2] == result.scores[3, 1, 2]
 
     monkeypatch.setattr(module, "stream_capture", interrupt)

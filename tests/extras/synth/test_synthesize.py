@@ -1,6 +1,5 @@
 """Synthetic captures: their files, and the scenes that are refused."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
 from morgs_mi.capture.truth import load_truth
+from morgs_mi.core.bounded import read_json
 from morgs_mi.extras.synth.disturbances import Disturbances
 from morgs_mi.extras.synth.scene import Light, Object, Scene, load_scene
 from morgs_mi.extras.synth.synth_config import SynthConfig
@@ -26,7 +26,7 @@ TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
 
 @pytest.mark.slow
 def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
-    metadata = json.loads((clip / "capture.json").read_text())
+    metadata = read_json(clip / "capture.json")
     assert metadata["test_view"] == 0
     assert (metadata["fps"], metadata["num_frames"], metadata["seed"]) == (30.0, 3, 0)
     expected = load_scene("arm").rig.cameras(3, 64, 48)
@@ -81,7 +81,7 @@ def test_synthesize__replaces_a_capture_with_overwrite_and_no_other_files(tmp_pa
     out = shutil.copytree(clip, tmp_path / "clip")
     counts = []
     synthesize("spheres", out, TINY, overwrite=True, progress=lambda *count: counts.append(count))
-    assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
+    assert read_json(out / "capture.json")["scene"] == "spheres"
     assert not (out / "cam02.mp4").exists()
     assert counts == [(1, 2), (2, 2)]
     with pytest.raises(

@@ -2,7 +2,6 @@
 Chromium.
 """
 
-import json
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morgs_mi.core.bounded import read_json
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.playback.export.web import write_web_folder
 from morgs_mi.playback.player import render
@@ -50,7 +50,7 @@ def example():
     page = re.search(
         r"```html\n(.*?)```", (ROOT / "docs/web-player.md").read_text(encoding="utf-8"), re.DOTALL
     )
-    lock = json.loads((ROOT / "web/package-lock.json").read_text(encoding="utf-8"))["packages"]
+    lock = read_json(ROOT / "web/package-lock.json")["packages"]
 
     def local(address):
         folder = f"node_modules/{address[1]}"

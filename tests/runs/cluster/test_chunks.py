@@ -2,7 +2,6 @@
 no trace.
 """
 
-import json
 import os
 import shutil
 import signal
@@ -13,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+
+from morgs_mi.core.bounded import read_json
 
 pytest.importorskip("distributed", reason="comes with the extra `cluster`")
 
@@ -74,7 +75,7 @@ def stream_of(out):
 
 
 def rows_of(out):
-    rows = json.loads((out / "report.json").read_text())["frames"]
+    rows = read_json(out / "report.json")["frames"]
     return [
         {name: value for name, value in row.items() if name not in ("seconds", "memory")}
         for row in rows
@@ -111,7 +112,7 @@ def test_ChunkedRun__joins_them_to_an_ordinary_stream(whole):
 
 @pytest.mark.slow
 def test_ChunkedRun__reports_frames_and_workers(whole):
-    report = json.loads((whole / "report.json").read_text())
+    report = read_json(whole / "report.json")
     packets = reversed(list(StreamReader(whole / "stream.morgs")))
     sizes = {packet.frame: packet.num_bytes for packet in packets}
     rows = [(row["frame"], row["num_bytes"]) for row in report["frames"]]
@@ -212,7 +213,7 @@ def test_ChunkedRun__keeps_an_earlier_fit_until_the_chunks_are_joined(
     with pytest.raises(KeyboardInterrupt):
         fit(capture, out, client, config=other, resume=True)
     monkeypatch.setattr(shutil, "rmtree", rmtree)
-    assert json.loads((out / "report.json").read_text())["config"]["seed"] == 1
+    assert read_json(out / "report.json")["config"]["seed"] == 1
     fit(capture, out, client, config=other, resume=True)
     assert StreamReader(out / "stream.morgs").metadata["config"]["seed"] == 1
     assert len(rows_of(out)) == FRAMES
