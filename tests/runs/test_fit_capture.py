@@ -21,9 +21,8 @@ from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next
