@@ -47,7 +47,7 @@ def main() -> None:
         video = VideoReader.open(_VIDEO)
         animation = cv2.Animation()
         animation.frames = [frame[..., ::-1].copy() for frame in video.frames()]
-        animation.durations = np.full(video.num_frames, 1e3 / (video.fps or 1), np.int32)
+        animation.durations = [round(1e3 / (video.fps or 1))] * video.num_frames
         cv2.imwriteanimation(str(_MOVING_PICTURE), animation, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
     config = DemoConfig()
     if not _CAPTURE.exists():
