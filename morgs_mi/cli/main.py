@@ -155,7 +155,7 @@ def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:
     try:
         with redirect_stdout(text):
             return parse()
-    finally:
+    except SystemExit:  # after the help, or a mistake before it
         width = shutil.get_terminal_size().columns
         command = next((COMMANDS[word] for word in args if word in COMMANDS), None)
         groups: Mapping[str, Sequence[str]] = getattr(command, "groups", {})
@@ -172,6 +172,7 @@ def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:
             line = line.replace(",", ", ") if line.startswith("usage:") else line
             blocks[title] += textwrap.wrap(line, width) if len(line) > width else [line]
         print_result("\n\n".join("\n".join(block).rstrip() for block in blocks.values()))
+        raise
 
 
 def _flush_output() -> None:
