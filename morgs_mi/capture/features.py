@@ -15,7 +15,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, unit_vectors
 from morgs_mi.core.rig import positions_of
 
 # Larger images add no corners that other views also see, and SIFT is slow.
@@ -304,13 +304,9 @@ def _widest_angles(
     """
     positions = positions_of(cameras)[views]
     with np.errstate(invalid="ignore"):
-        rays = _directions(points[track] - positions)
-        mean = _directions(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))
+        rays = unit_vectors(points[track] - positions)
+        mean = unit_vectors(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))
         angle = np.rad2deg(np.arccos(np.clip((rays * mean[track]).sum(1), -1, 1)))
     widest = np.zeros(len(points))
     np.maximum.at(widest, track, np.nan_to_num(angle))
     return 2 * widest
-
-
-def _directions(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -19,7 +19,7 @@ from morgs_mi.capture.features import (
     intersect_pairs,
     mutual_neighbours,
 )
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, unit_vectors
 
 # Largest distance from an epipolar line, px, and between two descriptors of length 1.
 _BAND = 1.0
@@ -93,7 +93,7 @@ def _carried(points: np.ndarray, vectors: np.ndarray, first: Camera, second: Cam
     both cameras.
     """
     rays = [points - camera.position for camera in (first, second)]
-    normals = sum(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    normals = sum(map(unit_vectors, rays))
     directions = (
         first.unproject(first.project(points)[0] + vectors, np.ones(len(points))) - first.position
     )

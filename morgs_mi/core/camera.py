@@ -154,8 +154,7 @@ class Camera:
         )
         forward = forward / distance
         right = right / np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
-        viewmat = np.vstack([np.column_stack([R, -R @ origin]), [0, 0, 0, 1.0]])
+        viewmat = pose_at(np.stack([right, np.cross(forward, right), forward]), origin)
         K = intrinsics_of_fov(fov_x, width, height)
         return cls(K, viewmat, width, height, name, near=min(0.01, float(distance) / 100))
 
@@ -251,7 +250,7 @@ class Camera:
         positions [..., 2].
         """
         directions = self.unproject(pixels, np.ones(np.shape(pixels)[:-1])) - self.position
-        return self.position, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        return self.position, unit_vectors(directions)
 
     def projection_jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the
@@ -343,9 +342,22 @@ def intrinsics_of_fov(
     """Return intrinsics [3, 3] of a field of view in degrees across, with Mitsuba's offsets."""
     f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
     # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
-    return np.array(
-        [[f, 0, width * (0.5 - offset_x)], [0, f, height * (0.5 - offset_y)], [0, 0, 1.0]]
-    )
+    return intrinsic_matrix(f, f, width * (0.5 - offset_x), height * (0.5 - offset_y))
+
+
+def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Return intrinsics [3, 3] of focal lengths and a principal point in pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def pose_at(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the extrinsics [4, 4] of a rotation [3, 3], world -> camera, at a position [3]."""
+    return np.vstack([np.column_stack([rotation, -rotation @ position]), [0, 0, 0, 1.0]])
+
+
+def unit_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Return the directions of vectors [..., 3]."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def rigid(where: str, matrix: np.ndarray) -> np.ndarray:

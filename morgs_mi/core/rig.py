@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, unit_vectors
 from morgs_mi.core.checks import require
 
 # Rows and columns of the points of each view.
@@ -76,13 +76,16 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     return up / np.linalg.norm(up)
 
 
-def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
+def focus_point(
+    cameras: Sequence[Camera], center: np.ndarray | None = None, weight: float = 1e-9
+) -> np.ndarray:
     """Return the point [3] that is nearest to all optical axes in the least-squares sense.
 
-    Along a direction that all axes share, it lies at the mean camera position.
+    Along a direction that all axes share, it lies at `center`, by default the mean camera position,
+    which has a weight relative to one axis.
     """
-    middle = np.mean([camera.position for camera in cameras], axis=0)
-    system = 1e-9 * np.eye(3)
+    middle = positions_of(cameras).mean(0) if center is None else center
+    system = weight * np.eye(3)
     right = np.zeros(3)
     for camera in cameras:
         axis = camera.rotation[2]
@@ -248,7 +251,7 @@ def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndar
 def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
     """Return the angle between two cameras as seen from each point, degrees."""
     rays = [camera.position - points for camera in (a, b)]
-    x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    x, y = map(unit_vectors, rays)
     return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
 
 

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from morgs_mi.core.bounded import read_json, warn_unread
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at
 from morgs_mi.core.checks import errors_at
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import seen_points, with_near_planes
@@ -64,12 +64,10 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
         for i in range(0, len(rows), -(-len(rows) // _MOST_CAMERAS)):
             row = rows[i]
             with errors_at(f"{file}: entry {i}: expected a camera, got a broken one"):
-                R = np.asarray(row["rotation"], np.float64)
-                viewmat = np.eye(4)
-                viewmat[:3, :3] = R.T
-                viewmat[:3, 3] = -R.T @ np.asarray(row["position"], np.float64)
+                R, position = (np.asarray(row[key], float) for key in ("rotation", "position"))
+                viewmat = pose_at(R.T, position)
                 width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
-                K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+                K = intrinsic_matrix(fx, fy, width / 2, height / 2)
                 name = str(row.get("img_name", i))
                 cameras.append(Camera(K, viewmat, round(width), round(height), name))
         return file, tuple(cameras)

@@ -30,7 +30,7 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.layouts.clips import clip_of_image, size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import read_json, warn_unread
-from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.camera import Camera, intrinsic_matrix, rigid
 from morgs_mi.core.checks import LARGEST, errors_at
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, existing_file
 from morgs_mi.io.ply import read_vertices
@@ -134,7 +134,7 @@ def _camera(values: Mapping[str, Any], name: str) -> Camera:
     fy = _focal_length(values, "y", height, fx)
     cx = _value(values, "cx", width / 2)
     cy = _value(values, "cy", height / 2)
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+    K = intrinsic_matrix(fx, fy, cx, cy)
     pose = rigid("`transform_matrix`", np.array(values.get("transform_matrix"), np.float64))
     viewmat = np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
     return Camera(K, viewmat, round(width), round(height), name)

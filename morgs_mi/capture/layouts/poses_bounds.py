@@ -18,7 +18,7 @@ from morgs_mi.capture.layouts.calibration import Calibration, Reader, required_c
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_array
-from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at, rigid
 from morgs_mi.core.checks import errors_at
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import Clip
@@ -50,10 +50,9 @@ def read_poses_bounds(
     for i, (row, name) in enumerate(zip(rows.astype(np.float64), names, strict=True)):
         with errors_at(f"{path}, row {i} ({name})"):
             down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
-            R = np.stack([right, down, -back])
-            pose = np.column_stack([R, -R @ centre])
+            pose = pose_at(np.stack([right, down, -back]), centre)
             viewmat = rigid("columns in the order down, right, back", pose)
-            K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+            K = intrinsic_matrix(focal, focal, 0.5 * width, 0.5 * height)
             cameras.append(Camera(K, viewmat, round(width), round(height), name))
     return tuple(cameras), rows[:, 15:].astype(np.float64)
 
@@ -69,7 +68,7 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
     rows = []
     for camera, near_far in zip(cameras, bounds, strict=True):
         f = camera.K[0, 0]
-        K = [[f, 0, 0.5 * camera.width], [0, f, 0.5 * camera.height], [0, 0, 1]]
+        K = intrinsic_matrix(f, f, 0.5 * camera.width, 0.5 * camera.height)
         if not np.allclose(camera.K, K, rtol=1e-6, atol=1e-3):
             raise ValueError(
                 f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "

@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from morgs_mi.capture.features import Tracks, intersect
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, pose_at
 from morgs_mi.fit.fit_config import CameraPriors
 
 # Number of parameters of a camera's change.
@@ -147,10 +147,8 @@ def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     K[[0, 1], [0, 1]] *= 1 + changes[6]
     K[:2, 2] += changes[7:9] * camera.width
     turn = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0]
-    V = np.eye(4)
-    V[:3, :3] = turn @ camera.rotation
-    V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
-    return replace(camera, K=K, viewmat=V)
+    viewmat = pose_at(turn @ camera.rotation, camera.position + changes[3:6])
+    return replace(camera, K=K, viewmat=viewmat)
 
 
 def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:

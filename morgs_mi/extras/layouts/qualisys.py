@@ -34,7 +34,7 @@ from morgs_mi.capture.layouts.calibration import (
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import check_claim, read_bytes, warn_unread
-from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.camera import Camera, pose_at, rigid
 from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
 
 _LOG = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
     K[:2, 2] -= left, top
     R = _OPENCV_FROM_OPENGL @ np.reshape(_numbers(where, element, "transform", _AXES), (3, 3))
     position = _METRES * np.array(_numbers(where, element, "transform", "xyz"))
-    viewmat = rigid(where, np.column_stack([R, -R @ position]))
+    viewmat = rigid(where, pose_at(R, position))
     lens = opencv_lens(_numbers(where, element, "intrinsic", _DISTORTION))
     with errors_at(where):
         size = round(right - left + 1), round(bottom - top + 1)

@@ -18,9 +18,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.camera import Camera, intrinsics_of_fov, rigid
+from morgs_mi.core.camera import (
+    Camera,
+    intrinsic_matrix,
+    intrinsics_of_fov,
+    pose_at,
+    rigid,
+)
 from morgs_mi.core.checks import check_number
-from morgs_mi.core.rig import positions_of, up_direction
+from morgs_mi.core.rig import focus_point, positions_of, up_direction
 from morgs_mi.io.listing import existing_file
 
 if TYPE_CHECKING:
@@ -73,12 +79,9 @@ class CameraPath:
         """Return the view at a time in seconds: the nearest key outside of all keys."""
         time = float(np.clip(time, 0, self.seconds))
         positions, rotations, intrinsics = self._splines
-        rotation = rotations(time).as_matrix().T
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation
-        viewmat[:3, 3] = -rotation @ positions(time)
+        viewmat = pose_at(rotations(time).as_matrix().T, positions(time))
         log_fx, log_fy, cx, cy = intrinsics(time)
-        K = np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fy), cy], [0, 0, 1]])
+        K = intrinsic_matrix(np.exp(log_fx), np.exp(log_fy), cx, cy)
         return replace(self.keys[0], K=K, viewmat=viewmat, name="path")
 
     def with_duration(self, seconds: float) -> CameraPath:
@@ -96,12 +99,11 @@ class CameraPath:
         from scipy.interpolate import CubicSpline
 
         views = [key.rotation.T for key in self.keys]
-        positions = np.stack([key.position for key in self.keys])
         K = np.stack([key.K for key in self.keys])
         # With logarithms the focal lengths stay positive where the spline overshoots.
         intrinsics = [np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]]
         return (
-            CubicSpline(self.times, positions),
+            CubicSpline(self.times, positions_of(self.keys)),
             RotationSpline(self.times, Rotation.from_matrix(np.stack(views))),
             CubicSpline(self.times, np.stack(intrinsics, axis=1)),
         )
@@ -113,13 +115,7 @@ def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     The median of the Gaussians' centres [N, 3] has a small weight; it determines the distance of
     parallel axes.
     """
-    weight = _MEDIAN_WEIGHT * len(cameras)
-    axes = np.array([camera.rotation[2] for camera in cameras])
-    positions = positions_of(cameras)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    A = weight * np.eye(3) + across.sum(axis=0)
-    b = weight * np.median(means, axis=0) + np.einsum("nij,nj->i", across, positions)
-    return np.linalg.solve(A, b)
+    return focus_point(cameras, np.median(means, axis=0), _MEDIAN_WEIGHT * len(cameras))
 
 
 def orbit(
