@@ -31,12 +31,14 @@ _LOCK = ".morgs-lock"
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, None, None]:
+def atomic_path(
+    path: str | os.PathLike[str], place: str, parents: bool = False
+) -> Generator[Path, None, None]:
     """Yield a path in the same folder for a file or folder, which is renamed to `path` when the
     body succeeds.
 
     On failure what was written is removed and `path` stays as it was. A file replaces a file; a
-    folder replaces one that existed from the start. Parent folders are not created.
+    folder replaces one that existed from the start. Missing `parents` are created where asked for.
 
     Raises:
         FileExistsError: `path` is a device or a pipe.
@@ -58,6 +60,8 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
         if is_partial and (int(number) == os.getpid() or not _alive(int(number))):
             _remove(leftover)
     try:
+        if parents:
+            final.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         if replaces_folder and partial.is_dir():
             final.rename(old)  # deleting takes time, and a half-deleted folder would look complete
@@ -149,8 +153,7 @@ def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
         OSError: the file cannot be written.
     """
     text = json.dumps(json_finite(value), indent=2, allow_nan=False) + "\n"
-    with atomic_path(path, "write_json()") as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path, "write_json()", parents=True) as partial:
         partial.write_text(text, encoding="utf-8")
 
 

@@ -36,6 +36,5 @@ def save_plot(path: Path, figure: Any, place: str) -> None:
     Raises:
         OSError: the file cannot be written; its sentence begins with `place`.
     """
-    with atomic_path(path, place) as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path, place, parents=True) as partial:
         figure.savefig(partial, format=path.suffix[1:].lower())

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.files import atomic_folder, atomic_path
+from morgs_mi.core.png import png_bytes
 
 PLAYABLE = "vp09"
 """Codec of videos in .mp4 that browsers and players open: VP9, which OpenCV's wheels have."""
@@ -39,15 +40,13 @@ def write_video(
     """
     path = Path(path)
     if path.suffix:
-        with atomic_path(path, "write_video()") as partial:
-            partial.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path, "write_video()", parents=True) as partial:
             _write_file(partial, path, frames, fps, codec)
         return
     with atomic_folder(path, "write_video()") as folder:
         for i, frame in enumerate(_checked(path, frames)):
             # Not cv2.imwrite, which does not report why it failed.
-            png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
-            (folder / f"{i:04d}.png").write_bytes(png.tobytes())
+            (folder / f"{i:04d}.png").write_bytes(png_bytes(frame))
 
 
 def _write_file(

@@ -146,8 +146,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
         OSError: the file cannot be written; the message names it and the cause.
         ValueError: the image has a shape that `to_uint8` does not accept.
     """
-    with atomic_path(path, "write_png()") as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path, "write_png()", parents=True) as partial:
         partial.write_bytes(png_bytes(to_uint8(image)))
 
 

@@ -195,8 +195,8 @@ def write_colmap(
     texts = {"cameras": camera_lines, "images": image_lines, "points3D": point_lines}
     with ExitStack() as files:
         for name, lines in texts.items():
-            partial = files.enter_context(atomic_path(folder / f"{name}.txt", "write_colmap()"))
-            partial.parent.mkdir(parents=True, exist_ok=True)
+            file = atomic_path(folder / f"{name}.txt", "write_colmap()", parents=True)
+            partial = files.enter_context(file)
             partial.write_text("".join(lines), encoding="utf-8")
 
 
