@@ -41,7 +41,7 @@ import numpy as np
 from morgs_mi.core.attributes import shape_attribute_widths
 from morgs_mi.core.checks import require
 from morgs_mi.core.extras import places
-from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.gaussians import ActivatedGaussians, require_some
 from morgs_mi.core.memory import from_numpy, owned_copy
 
 # The class of each plugin, MODULE:NAME.
@@ -66,11 +66,7 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     Raises:
         ValueError: there are no Gaussians. (Mitsuba would end the process.)
     """
-    if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
-        raise ValueError(
-            "ellipsoids(): `gaussians` must be at least one Gaussian, got a "
-            f"{type(gaussians).__name__} without any; leave the shape out of the scene."
-        )
+    require_some("ellipsoids()", gaussians, "leave the shape out of the scene")
     names = ("means", "scales", "quats", *shape_attribute_widths())
     values = {name: getattr(gaussians, name, None) for name in names}
     values = {

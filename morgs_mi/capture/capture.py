@@ -192,7 +192,7 @@ class Capture:
         masks = _masks(sources, rig.cameras)
         return replace(rig, masks=masks, _sources=tuple(sources), distortions=radial_terms)
 
-    def holding_out(self, views: int | str | Sequence[int | str] | None) -> Capture:
+    def holding_out(self, views: TestViews) -> Capture:
         """Return the capture with other held-out cameras, by indices or names; None for none.
 
         Raises:

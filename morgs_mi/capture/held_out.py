@@ -48,9 +48,7 @@ def held_out_by(
     return held_out_views(path, names, subset.names)
 
 
-def held_out_views(
-    path: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]
-) -> tuple[int, ...]:
+def held_out_views(path: Path, views: TestViews, names: Sequence[str]) -> tuple[int, ...]:
     """Return the ascending indices of cameras that are held out.
 
     Args:
@@ -67,9 +65,7 @@ def held_out_views(
     return indices
 
 
-def _indices(
-    place: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]
-) -> tuple[int, ...]:
+def _indices(place: Path, views: TestViews, names: Sequence[str]) -> tuple[int, ...]:
     """Return the ascending indices of cameras; `place` is where they were requested."""
     if views is None:
         return ()

@@ -289,7 +289,7 @@ def _clocks(
     for c, reader in enumerate(readers):
         if reader.positions is not None:
             # Of a frame before the first or after the last one, too.
-            index = round(config.offset.get(names[c], 0))
+            index = round(float(offsets[c]))
             nearest = min(max(index, 0), len(reader.positions) - 1)
             offsets[c] = round(reader.positions[nearest]) + index - nearest
     return _Clocks(offsets, rates, lowest)
@@ -387,14 +387,11 @@ def _num_frames(
     if gaps:
         longest = max(map(_periods, readers))
         return min(longest, max_frames or longest)
-    for reader in readers:
-        required = min(reader.num_frames, max_frames or reader.num_frames)
+    lengths = [min(reader.num_frames, max_frames or reader.num_frames) for reader in readers]
+    for reader, required in zip(readers, lengths, strict=True):
         _check_complete(reader, required)
         _check_even(reader, required)
-    lengths = [reader.num_frames for reader in readers]
     shortest = min(lengths)
-    if max_frames is not None and max_frames <= shortest:
-        return max_frames
     if max(lengths) > shortest:
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(

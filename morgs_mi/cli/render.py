@@ -105,6 +105,7 @@ class Render:
             raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
         stream = opened(self.source, self.drop_invalid, skip_damaged=self.skip_damaged)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
+        view = view if self.width is None else view.with_width(self.width)
         is_path = self.camera is None and self.insert is None
         stem = Path(self.path or "orbit").stem if is_path else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, stem)
@@ -121,7 +122,6 @@ class Render:
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
-            view = view if self.width is None else view.with_width(self.width)
             images = render_stream(stream, view, channels)
             count = len(frame_numbers(stream))
         else:
@@ -150,7 +150,6 @@ class Render:
 
         assert self.insert is not None
         insert = extra("renderings", "insert")
-        view = view if self.width is None else view.with_width(self.width)
         frames = frame_numbers(stream) if self.at is None else insert.selected(stream, self.at)
         channels = self.channels or ("color",)
         if not self.channels and format == "exr":

@@ -229,11 +229,11 @@ def groups_of(gaussians: Gaussians) -> Arrays:
 def check_finite(groups: Arrays) -> None:
     """Raise a ValueError if a raw attribute is not finite."""
     for name, value in groups.items():
-        if not np.isfinite(value).all():
-            row = np.argwhere(~np.isfinite(value))[0][0]
+        bad = np.argwhere(~np.isfinite(value))
+        if len(bad):
             raise ValueError(
-                f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the "
-                "learning rates."
+                f"the stream: `{name}` must be finite, that of Gaussian {bad[0][0]} is not; lower "
+                "the learning rates."
             )
 
 

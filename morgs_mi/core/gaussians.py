@@ -70,6 +70,21 @@ class ActivatedGaussians(Protocol):
         ...
 
 
+def require_some(place: str, gaussians: ActivatedGaussians, remedy: str) -> None:
+    """Raise an error unless there is at least one Gaussian.
+
+    Raises:
+        ValueError: there is none, in a sentence that begins with `place` and ends with `remedy`.
+    """
+    require(
+        hasattr(gaussians, "means") and int(gaussians.means.shape[0]),
+        place,
+        "`gaussians` must be at least one Gaussian",
+        f"a {type(gaussians).__name__} without any",
+        remedy,
+    )
+
+
 def displaced(gaussians: Gaussians, displacement: np.ndarray) -> Gaussians:
     """Return N Gaussians that have moved by displacements [N, 3], world units, in a frame."""
     return replace(
@@ -294,9 +309,7 @@ class Gaussians:
 
     def items(self) -> Tensors:
         """Return the raw attributes that are present, by the names of the fields."""
-        return {
-            f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
-        }
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     def numpy(self) -> Arrays:
         """Return copies of the raw attributes that are present, as NumPy arrays."""

@@ -124,9 +124,8 @@ def rigid_motions(
         center = p.mean(0)
         target = q.mean(0)
         size = np.linalg.norm(p - center, axis=-1).max()
-        spread = np.linalg.svd((q - target).T @ (p - center) / len(p), compute_uv=False)
         # The rotation that maps p best to q, both around their means.
-        U, _, Vt = np.linalg.svd((q - target).T @ (p - center))
+        U, spread, Vt = np.linalg.svd((q - target).T @ (p - center) / len(p))
         U[:, 2] *= np.linalg.det(U @ Vt)
         rotation = U @ Vt
         shift = target - rotation @ center

@@ -184,6 +184,7 @@ def fit_first_frame(
         on_round: called with the Gaussians before each round of density control.
         limit: of the time, seconds, for which steps are skipped; None: none.
     """
+    progress = progress or Progress()
     steps = config.planned_steps
     start = problem.start
     # Steps before which a band is added; 3 times a thirtieth of 30 is 3, and not below.
@@ -208,10 +209,6 @@ def fit_first_frame(
     order = iter(view_order(len(views), steps, rng))
     pace = _Pace(steps, limit)
 
-    def on_step(_: int) -> None:
-        if progress is not None:
-            progress(min(pace.position + 1, steps), steps)
-
     for first, stop in pairwise(sorted({0, *bands, *rounds, steps})):
         if on_round is not None and first in rounds:
             on_round(start.with_parameters(values_of(optimizer)))
@@ -230,7 +227,7 @@ def fit_first_frame(
         chunk = Steps(
             pace.views(order, stop),
             rate_factor=lambda _: _FINAL_RATE ** (pace.position / steps),
-            on_step=on_step,
+            on_step=lambda _: progress(min(pace.position + 1, steps), steps),
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )
         losses = optimise(optimizer, rates, losses_at, chunk)

@@ -62,7 +62,7 @@ class Exposure:
 
     def __call__(self, colors: np.ndarray) -> np.ndarray:
         """Return how the camera shows colours [..., 3] of the scene; not clipped."""
-        return colors * np.array(self.gain) + np.array(self.bias)
+        return colors * self.gain + self.bias
 
     def corrected(self, image: np.ndarray) -> np.ndarray:
         """Return the image [H, W, 3], uint8 or encoded floats, in the scene's colours; clipped
@@ -79,7 +79,7 @@ class Exposure:
     def after(self, first: Exposure) -> Exposure:
         """Return the exposure that acts as `first` and then this one."""
         gain = np.array(self.gain)
-        return _exposure(gain * first.gain, gain * first.bias + np.array(self.bias))
+        return _exposure(gain * first.gain, gain * first.bias + self.bias)
 
     def without(self, first: Exposure) -> Exposure:
         """Return the exposure that, after `first`, acts as this one."""

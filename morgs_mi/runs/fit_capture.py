@@ -98,7 +98,8 @@ def stream_capture(
         train = prepared.capture.train_views
         last = prepared.capture.num_frames - 1
         later_frames = stages.of("Later frames")
-        with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
+        metadata |= about_lenses(prepared.capture)
+        with Recording(files, prepared.capture, metadata, earlier) as recording:
 
             def show(keyframe: Packet) -> None:
                 recording.show(keyframe)
@@ -165,11 +166,6 @@ class Prepared:
         stage = progress.of("Refining cameras")
         refine_cameras = extra("camera refinement", "first frame")
         return cls(*refine_cameras(capture, config.fit, config.render, config.seed, stage))
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """Entries of the stream's header about the cameras."""
-        return about_lenses(self.capture)
 
     def completed(
         self,

@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.gaussians import ActivatedGaussians, require_some
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Jit, UInt32
 from morgs_mi.render.projection import FARTHEST
@@ -168,11 +168,7 @@ class SplatRays:
     """
 
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
-        if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
-            raise ValueError(
-                "SplatRays(): `gaussians` must be at least one Gaussian, got a "
-                f"{type(gaussians).__name__} without any; pass some."
-            )
+        require_some("SplatRays()", gaussians, "pass some")
         self._config = config or RenderConfig()
         names = ("means", "scales", "quats", "opacities", "sh_coeffs")
         means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)

@@ -383,7 +383,7 @@ def _rectangle(box: Any, camera: Camera, crop: Crop) -> tuple[np.ndarray, list[i
     high = np.array(crop[2:])
     if (depth >= camera.near).all():
         ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
-        low, high = np.clip(ends - np.array(crop[:2]), 0, high)
+        low, high = np.clip(ends - crop[:2], 0, high)
     return low.astype(int), (high - low).astype(int).tolist()
 
 

@@ -37,6 +37,7 @@ from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.extras.live.sources import Source, open_feed
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.playback.stream_header import about_lenses
 from morgs_mi.runs.fit_capture import Prepared, push_frame
 from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
@@ -275,7 +276,8 @@ def _fit(
     frames.capture = prepared.capture
     loop = StreamLoop.of(prepared.capture, config)
     rows: list[LiveFrame] = []
-    with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
+    metadata |= about_lenses(prepared.capture)
+    with Recording(FitFiles.of(out), prepared.capture, metadata) as recording:
         try:
             for frame_set, frame in frames:
                 writing_task = in_background(partial(_record, frames, out, frame_set, frame))

@@ -65,10 +65,6 @@ class ChunkConfig:
     its first frame.
     """
 
-    def overlap_config(self, config: StreamConfig) -> StreamConfig:
-        """Return the settings of the other frames of the overlap."""
-        return replace(config, fit=replace(config.fit, epochs=_OVERLAP_EPOCHS * config.fit.epochs))
-
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
         """Return the settings of one of these fits."""
         rates = {name: _RATES * rate for name, rate in asdict(config.fit.rates).items()}
@@ -196,7 +192,8 @@ def _first_frame(fit: Fit, chunk: Chunk) -> tuple[Packet, FrameReport]:
     capture = fit.open()
     common = chunk.coded
     assert common is not None
-    loop = StreamLoop.of(capture, fit.chunks.overlap_config(fit.config))
+    longer_fit = replace(fit.config.fit, epochs=_OVERLAP_EPOCHS * fit.config.fit.epochs)
+    loop = StreamLoop.of(capture, replace(fit.config, fit=longer_fit))
     frame = max(chunk.start - fit.chunks.overlap, common.frame + 1)
     loop.resume(common, _images(capture, 0, common.frame + 1), fit.balance)
     (images,) = _images(capture, frame, frame + 1)
