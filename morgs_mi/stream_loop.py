@@ -132,8 +132,7 @@ def step(
             for v, first in enumerate(fitted.exposures)
         ),
     )
-    next_state = StreamState(frame + 1, coded, observation.history, fitted.exposures)
-    return next_state, packet, report
+    return StreamState(frame + 1, coded, observation.history, fitted.exposures), packet, report
 
 
 def _fit_later_frame(

@@ -62,8 +62,7 @@ class CameraSource:
         """Return the source without a delay: its images are interpolated instead."""
         positions = self.times.frame_indices - self.times.delay
         indices = np.floor(positions).astype(int)
-        times = ClipTimes(indices, positions - indices, 0.0, self.times.rate)
-        return replace(self, times=times)
+        return replace(self, times=ClipTimes(indices, positions - indices, 0.0, self.times.rate))
 
     def images(
         self, camera: Camera, start: int, stop: int | None

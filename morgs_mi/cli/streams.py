@@ -76,8 +76,7 @@ def opened(
     """
     from morgs_mi.playback.streams import DRAWN, SplatFile, open_stream
 
-    most_invalid = 1.0 if drop_invalid else DRAWN if drawn else 0.0
-    stream = open_stream(out, most_invalid, skip_damaged)
+    stream = open_stream(out, 1.0 if drop_invalid else DRAWN if drawn else 0.0, skip_damaged)
     if drawn and isinstance(stream, SplatFile) and stream.cameras_file is not None:
         print_warning(f"Cameras: {stream.cameras_file}.")
     return stream
@@ -109,7 +108,7 @@ class ExportKind:
 
     formats: ClassVar[tuple[Format, ...]]
     drawn: ClassVar[bool] = False
-    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames", "least": "--least-seconds"}
+    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self, stream: FrameSource) -> None:
         options: Mapping[str, Any] = vars(self)

@@ -243,8 +243,7 @@ class Packet:
             array.astype(_DTYPES[array.dtype.name]).tobytes() for array in self.arrays.values()
         ]
         table = json.dumps(rows).encode()
-        payload = b"".join([_U32.pack(len(table)), table, *contents])
-        return _sealed(self.kind, self.frame, payload)
+        return _sealed(self.kind, self.frame, b"".join([_U32.pack(len(table)), table, *contents]))
 
     @property
     def num_bytes(self) -> int:

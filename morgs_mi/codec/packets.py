@@ -248,8 +248,7 @@ def residual_packet(
     N = len(grid)
     source = np.arange(N) if source is None else np.asarray(source)
     survivors = source[source >= 0]
-    attributes = (gaussians.sh_degree, optional_mask(gaussians.items()))
-    assert attributes == (grid.degree, grid.optional)
+    assert (gaussians.sh_degree, optional_mask(gaussians.items())) == (grid.degree, grid.optional)
     assert np.all(np.diff(survivors) > 0)
     groups = groups_of(gaussians)
     check_finite(groups)
@@ -276,11 +275,9 @@ def residual_packet(
         # The least quantizer step at which the changes are estimated to take `target` bytes.
         def fits(step: int) -> bool:
             r = coder.rounded(step)
-            bits = sum(map(column_bits, coder.columns(r)))
-            return bits / 8 <= target
+            return sum(map(column_bits, coder.columns(r))) / 8 <= target
 
-        steps = range(_MAX_QUANTIZER_STEP)
-        quantizer_step = bisect_left(steps, True, quantizer_step, key=fits)
+        quantizer_step = bisect_left(range(_MAX_QUANTIZER_STEP), True, quantizer_step, key=fits)
     codes = _codes(coder, quantizer_step, birth_grid)
     while (
         target

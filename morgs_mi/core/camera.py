@@ -95,8 +95,7 @@ class Camera:
         else:
             viewmat = rigid(f"{where}, `viewmat`", numbers(where, "viewmat", viewmat, 4, 4))
         if self.background is not None:
-            size = (self.height, self.width, 3)
-            image = numbers(where, "background", self.background, *size)
+            image = numbers(where, "background", self.background, self.height, self.width, 3)
             require(
                 image.dtype == np.uint8 or bounded(image),
                 where,

@@ -98,8 +98,7 @@ def balance_cameras(
     def fitted(start: Gaussians, exposures: Sequence[Exposure], steps: int) -> Gaussians:
         """Return Gaussians after some steps, from a start, in the colours of the scene."""
         nonlocal count
-        views = _corrected(visible, exposures)
-        fit_problem = replace(problem, start=start, views=tuple(views))
+        fit_problem = replace(problem, start=start, views=tuple(_corrected(visible, exposures)))
         fit_config = replace(short_config, first_frame_steps=steps)
         result = fit_first_frame(fit_problem, fit_config, rng_of(seed, Stream.BALANCE))
         count += 1

@@ -93,8 +93,7 @@ def plan_growth(
     """
     means = np.asarray(gaussians.means)
     opacities = np.asarray(gaussians.opacities)
-    visible = (opacities >= config.min_opacity) & ~in_empty_space(cameras, means)
-    survivors = _survivors(visible)
+    survivors = _survivors((opacities >= config.min_opacity) & ~in_empty_space(cameras, means))
     parents = _parents(survivors, scores, births, 0)
     parent = np.concatenate([survivors, parents])
     is_parent = np.isin(parent, parents)

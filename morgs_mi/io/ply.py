@@ -97,8 +97,7 @@ def write_ply(
                 columns[tuple(f"{name}_{i}" for i in range(table.shape[1]))] = table
     else:
         columns[_DC] = raw["sh_coeffs"][:, 0]
-        rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
-        columns[rest_names(K)] = rest
+        columns[rest_names(K)] = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
         columns[("opacity",)] = raw["logit_opacities"][:, None]
     columns |= {_SCALE: raw["log_scales"], _ROTATION: unit_quats(gaussians)}
     names = [name for names in columns for name in names]

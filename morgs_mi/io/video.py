@@ -13,7 +13,6 @@ from __future__ import annotations
 import logging
 import math
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -61,13 +60,13 @@ def natural_key(name: str) -> list[str | int]:
     return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
 
 
-class _Frames(ABC):
+class _Frames:
     """The members that the readers share."""
 
     num_frames: int
 
-    @abstractmethod
-    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]: ...
+    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
+        raise NotImplementedError
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -135,8 +134,7 @@ class VideoReader(_Frames):
             stamps = None
             present = {time for time in shown if time is not None}
             if first.pts is not None and len(present) == len(shown):
-                held = [time for time in present if time >= first.pts]
-                stamps = np.array(sorted(held), np.int64)
+                stamps = np.array(sorted(t for t in present if t >= first.pts), np.int64)
             num_held = len(shown if stamps is None else stamps)
             num_frames = stream.frames - hidden if stream.frames else 0
             if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
@@ -470,8 +468,7 @@ def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> Fram
 
 def _images(path: Path) -> dict[int, Path]:
     """Return a folder's images by their numbers, in natural order."""
-    images = images_in(path) if path.is_dir() else []
-    files = sorted(images, key=lambda f: natural_key(f.stem))
+    files = sorted(images_in(path) if path.is_dir() else [], key=lambda f: natural_key(f.stem))
     if not files:
         suffixes = ", ".join((*IMAGE_SUFFIXES, EXR_SUFFIX))
         raise FileNotFoundError(f"{path}: expected images ({suffixes}), found none; extract them.")

@@ -76,8 +76,7 @@ def fit_gaussians(
     """
     points = np.zeros((0, 3)) if points is None else points
     point_colors = np.full(np.shape(points), 0.5) if point_colors is None else point_colors
-    cameras = [Camera.of(sensor) for sensor in sensors]
-    setup = prepare(cameras, points, point_colors, config, masks)
+    setup = prepare([Camera.of(sensor) for sensor in sensors], points, point_colors, config, masks)
     observed = observe_frame(setup, 0, ImageHistory(), images)
     packet, _ = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
     return decode(None, packet).gaussians

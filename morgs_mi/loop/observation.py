@@ -233,8 +233,7 @@ def _flows(
     common_views = sorted(previous.keys() & images.keys())
     key_views = [v for v in setup.key_views if v in common_views]
     if len(key_views) < len(setup.key_views) and common_views:  # others, where some lack an image
-        cameras = [setup.cameras[v] for v in common_views]
-        chosen = choose_key_views(cameras, len(setup.key_views))
+        chosen = choose_key_views([setup.cameras[v] for v in common_views], len(setup.key_views))
         key_views = [common_views[k] for k in chosen]
     pairs = {}
     for v in key_views:

@@ -270,8 +270,7 @@ def find_active_set(
         active |= _inside_unexplained(view, active)
     # Those that hardly change are drawn in some views only.
     indices = [*cameras]
-    quiet_views = choose_key_views([*cameras.values()], config.quiet_views)
-    some = {indices[k] for k in quiet_views}
+    some = {indices[k] for k in choose_key_views([*cameras.values()], config.quiet_views)}
     drawn = {v: active if v in some else active & (shares > QUIET) for v in cameras}
     blocks_by_view = {
         v: view.boxes.union(drawn[v], view.view.grid) | (view.counts > 0)

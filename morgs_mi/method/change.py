@@ -122,8 +122,7 @@ def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
     if not change.size:
         return np.zeros((1, 1), np.float32)
     a, b, c, d = (change[y::step, x::step] for y in (0, 1) for x in (0, 1))
-    median = cv2.medianBlur(np.abs(a - b - c + d) / 2, 5)
-    return _NORMAL * cv2.blur(median, (3, 3))
+    return _NORMAL * cv2.blur(cv2.medianBlur(np.abs(a - b - c + d) / 2, 5), (3, 3))
 
 
 def moving_region(change: np.ndarray) -> np.ndarray:

@@ -51,8 +51,7 @@ def flow_mask(motion: np.ndarray, reliable: np.ndarray, config: MaskConfig) -> n
         reliable: [H, W] bool; unreliable pixels are not in the mask.
         config: settings of the threshold.
     """
-    speed = np.linalg.norm(motion, axis=-1)
-    return (speed > flow_threshold(motion, reliable, config)) & reliable
+    return (np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)) & reliable
 
 
 def motion_mask(

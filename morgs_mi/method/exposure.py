@@ -176,8 +176,7 @@ def common_change(exposures: Sequence[Exposure]) -> Exposure:
     """
     if len(exposures) < 3:
         return Exposure()
-    lines = np.array([(e.gain, e.bias) for e in exposures])
-    middle = _exposure(*np.median(lines, axis=0))
+    middle = _exposure(*np.median(np.array([(e.gain, e.bias) for e in exposures]), axis=0))
     middle_tones = middle(_TONES)
     spread = float(np.median([np.abs(e(_TONES) - middle_tones).max() for e in exposures]))
     return middle if spread < 0.5 * middle.change else Exposure()

@@ -87,8 +87,7 @@ def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int) -> Tensor:
     """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W]
     (eq. 11), as `flow_loss`.
     """
-    total = dr.sum(dr.abs(confidence.array - mask.array))
-    return total * dr.opaque(mi.Float, 1 / num_pixels)
+    return dr.sum(dr.abs(confidence.array - mask.array)) * dr.opaque(mi.Float, 1 / num_pixels)
 
 
 def offset_loss(offset: Tensor, extent: float, num_gaussians: int) -> Tensor:

@@ -97,8 +97,7 @@ class Planes:
         """Return (strip, row) of `count` strips of every row, and the place of strip `first` +
         strip in each plane.
         """
-        lane = dr.arange(mi.UInt32, self.height * count)
-        y, strip = quotient_and_rest(lane, count)
+        y, strip = quotient_and_rest(dr.arange(mi.UInt32, self.height * count), count)
         x = (strip + first) * STRIP - _SPARE * STRIP
         return (
             strip,
@@ -165,8 +164,7 @@ class Planes:
             cells = np.any(mask.reshape(self.height, self.num_strips, STRIP), axis=2)
         cells = np.pad(cells, ((0, 0), (1, 1)))
         if reach:  # those within `reach` rows, or in the next strip, too
-            window = np.ones((2 * reach + 1, 3), np.uint8)
-            cells = cv2.dilate(cells.astype(np.uint8), window) > 0
+            cells = cv2.dilate(cells.astype(np.uint8), np.ones((2 * reach + 1, 3), np.uint8)) > 0
             cells[:, 0] = cells[:, 1]
             cells[:, -1] = cells[:, -2]
         # The runs of cells in each column, in parts that are not too long.

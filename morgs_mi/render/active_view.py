@@ -170,8 +170,7 @@ class ViewGroup:
         V = len(self.views)
         cameras = [view.camera for view in self.views]
         with dr.suspend_grad():
-            lane = dr.arange(mi.UInt32, N * V)
-            view, row = quotient_and_rest(lane, N)
+            view, row = quotient_and_rest(dr.arange(mi.UInt32, N * V), N)
             lanes = dr.compress(
                 touches(project(gaussians, Views(cameras, view), (), self.config, row), self.region)
             )

@@ -164,7 +164,6 @@ def padded(image: Float, region: Region, size: int) -> Float:
         # In memory allocated by Dr.Jit (see `memory.owned_copy`); a product fuses with the kernel
         # of the gradient.
         return image * dr.opaque(mi.Float, 1)
-    lane = dr.arange(mi.UInt32, total)
-    row, column = quotient_and_rest(lane, region.row * size)
+    row, column = quotient_and_rest(dr.arange(mi.UInt32, total), region.row * size)
     width = dr.opaque(mi.UInt32, region.width * size)
     return dr.gather(mi.Float, image, row * width + column, active=column < width)

@@ -84,8 +84,7 @@ def stream_capture(
     stages = Progress(progress)
     with locked_folder(out, "stream_capture()"):
         files = FitFiles.of(out)
-        first = next(capture.partial_frames(0, 1))
-        metadata = stream_metadata(capture, first, config)
+        metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
         earlier = interrupted_fit(files, capture, metadata) if resume else None
         if earlier is None:
             prepared = Prepared.of(capture, config, stages)

@@ -87,15 +87,6 @@ class FitFiles(NamedTuple):
         """Return the files of a fit in the folder `out`."""
         return cls(*(out / name for name in (STREAM, REPORT, CAPTURE)))
 
-    def replace_by_next(self) -> None:
-        """Replace these files by the `next` ones; `settle` finishes what a kill leaves undone.
-
-        Raises:
-            OSError: a file cannot be renamed.
-        """
-        self.next.stream.replace(self.stream)
-        self.settle()
-
     def settle(self) -> None:
         """Finish a replacement that was cut off, or remove the `next` files of one that had not
         begun.
@@ -238,7 +229,9 @@ class Recording:
             self._writer.write(packet)
         self.reports = reports
         if self._written_files is not self._files:
-            self._files.replace_by_next()
+            # `settle` finishes what a kill leaves undone.
+            self._files.next.stream.replace(self._files.stream)
+            self._files.settle()
             self._written_files = self._files
 
     def _check_in_place(self) -> None:

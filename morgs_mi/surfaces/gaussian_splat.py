@@ -297,8 +297,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             raise ValueError(f"gaussian_splat: {problem}.")
         self.background = None
         if background is not None:
-            values = np.ravel(background).astype(float)
-            self.background = mi.Color3f(np.broadcast_to(values, 3))
+            self.background = mi.Color3f(np.broadcast_to(np.ravel(background).astype(float), 3))
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
 

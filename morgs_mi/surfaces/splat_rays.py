@@ -174,8 +174,7 @@ class SplatRays:
         means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
         # A quaternion of length 0 is the identity.
-        lengths = np.linalg.norm(quats, axis=1, keepdims=True)
-        quats = np.where(lengths > 0, quats, [1, 0, 0, 0])
+        quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
         axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
         # Distances from the centre, in standard deviations, at which alpha is too small.
         opacities = opacities.ravel()

@@ -165,8 +165,7 @@ def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float
         camera_id, model, width, height = file.take(_CAMERA_BYTES)
         # The caller refuses another model by its name.
         name = names.get(model, f"number {model}")
-        params = file.take(f"<{2 + sum(MODELS.get(name, ()))}d")
-        yield camera_id, name, width, height, params
+        yield camera_id, name, width, height, file.take(f"<{2 + sum(MODELS.get(name, ()))}d")
 
 
 def binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:

@@ -136,8 +136,7 @@ def _camera(values: Mapping[str, Any], name: str) -> Camera:
     cy = _value(values, "cy", height / 2)
     K = intrinsic_matrix(fx, fy, cx, cy)
     pose = rigid("`transform_matrix`", np.array(values.get("transform_matrix"), np.float64))
-    viewmat = np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
-    return Camera(K, viewmat, round(width), round(height), name)
+    return Camera(K, np.linalg.inv(pose @ _OPENGL_FROM_OPENCV), round(width), round(height), name)
 
 
 def _focal_length(

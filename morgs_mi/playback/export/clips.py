@@ -217,12 +217,15 @@ def named_path(
         stream: the file.
         name: of the path or the file.
         degrees: angle of an orbit, see `orbit`; by default 60 for Gaussians without a recording.
-        least_seconds: shorter clips are repeated, see `repeated_seconds`.
+        least_seconds: a shorter clip is played as often as it takes.
 
     Raises:
-        FileNotFoundError, ValueError: as `through_cameras`, `orbit` and `load_path`.
+        FileNotFoundError, ValueError: as `through_cameras`, `orbit` and `load_path`, or
+            `least_seconds` is negative or not finite.
     """
-    clip = repeated_seconds(len(frame_numbers(stream)) / stream.fps, least_seconds)
+    check_number("named_path()", "least_seconds", least_seconds, "[0, inf)")
+    clip = len(frame_numbers(stream)) / stream.fps
+    clip *= max(1, math.ceil(least_seconds / clip - 1e-9))
     if name == "between":
         return through_cameras(stream.cameras, clip)
     if name == "orbit":
@@ -233,17 +236,6 @@ def named_path(
     origin = stream_origin(stream)
     path = load_path(name, moved(stream.cameras, -origin))
     return replace(path, keys=moved(path.keys, origin))
-
-
-def repeated_seconds(clip: float, least: float) -> float:
-    """Return the duration of as many plays of a clip as last at least `least` seconds, at least
-    one.
-
-    Raises:
-        ValueError: `least` is negative or not finite.
-    """
-    check_number("repeated_seconds()", "least", least, "[0, inf)")
-    return clip * max(1, math.ceil(least / clip - 1e-9))
 
 
 def repeated_frames(

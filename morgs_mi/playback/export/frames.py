@@ -65,8 +65,7 @@ def write_images(
             if kind == "exr":
                 write_exr(path, exr_channels(images))
             elif transparent:
-                alpha = np.clip(images["alpha"], 1e-6, 1)
-                straight_colors = to_uint8(images["color"] / alpha)
+                straight_colors = to_uint8(images["color"] / np.clip(images["alpha"], 1e-6, 1))
                 bytes_of_alpha = np.uint8(255 * images["alpha"].clip(0, 1) + 0.5)
                 rgba = np.concatenate([straight_colors, bytes_of_alpha], axis=2)
                 path.parent.mkdir(parents=True, exist_ok=True)

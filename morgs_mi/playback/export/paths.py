@@ -142,8 +142,7 @@ def orbit(
     start = 0 if degrees == 360 else -degrees / 2
     # The key views are about 10 degrees apart.
     angles = np.linspace(start, start + degrees, max(5, round(degrees / 10) + 1))
-    rotations = Rotation.from_rotvec(np.deg2rad(angles)[:, None] * up)
-    positions = center + rotations.apply(arm)
+    positions = center + Rotation.from_rotvec(np.deg2rad(angles)[:, None] * up).apply(arm)
     keys = tuple(_look_at(position, center, up, first) for position in positions)
     return CameraPath(np.linspace(0, seconds, len(keys)), keys)
 
@@ -167,8 +166,7 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
     steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1)
     # A rotation between cameras at the same position takes time too.
     steps = np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
-    times = np.concatenate([[0], np.cumsum(steps)])
-    return CameraPath(times, tuple(keys)).with_duration(seconds)
+    return CameraPath(np.concatenate([[0], np.cumsum(steps)]), tuple(keys)).with_duration(seconds)
 
 
 def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:

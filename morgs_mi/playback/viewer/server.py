@@ -110,10 +110,8 @@ class Viewer:
             Route("/recorded/{view:int}/{frame:int}", self._send_recorded),
             Route("/exact/{frame:int}/{channel}", self._send_exact),
         ]
-        handlers = {OSError: _failed, ValueError: _failed}
-        app = Starlette(routes=routes, exception_handlers=handlers)
-        config = uvicorn.Config(Access(app, host, token), **_OPTIONS)
-        self._server = uvicorn.Server(config)
+        app = Starlette(routes=routes, exception_handlers={OSError: _failed, ValueError: _failed})
+        self._server = uvicorn.Server(uvicorn.Config(Access(app, host, token), **_OPTIONS))
 
     def run(self) -> None:
         """Serve the page until `stop` is called, or a signal, which is raised again after the
@@ -158,8 +156,7 @@ class Viewer:
         return _stream_response(self._newest(), request)
 
     def _send_recorded(self, request: Request) -> Response:
-        stream = StreamReader(self._newest(), follow=False)
-        image = self._recorded.at(stream, **request.path_params)
+        image = self._recorded.at(StreamReader(self._newest(), follow=False), **request.path_params)
         return Response(
             cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg"
         )
