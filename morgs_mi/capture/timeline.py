@@ -217,10 +217,9 @@ def _by_numbers(
     first = min(clip[0] for clip in group.values())
     clips = [group.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
     offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
-    rates = np.array([lcm(*steps) / clip.step for clip in clips])
     return _Clocks(
         clocks.offsets + offsets * clocks.rates,
-        clocks.rates * rates,
+        clocks.rates * np.array([lcm(*steps) / clip.step for clip in clips]),
         # The time between two timestamps, in frames of the clip with the most frames per time.
         clocks.fps / (lcm(*steps) / min(steps)),
     ), notes

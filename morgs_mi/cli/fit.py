@@ -110,11 +110,10 @@ class Fit:
             from morgs_mi.runs.cluster.workers import open_client
 
             chunks = ChunkConfig(self.chunks or 1)
-            workers = min(chunks.count, usable_cores())
             with (
                 noting_chunks(self.out),
                 progress() as report,
-                open_client(self.scheduler, workers) as client,
+                open_client(self.scheduler, min(chunks.count, usable_cores())) as client,
             ):
                 run = ChunkedRun(capture, self.out, client, config, chunks, report)
                 reports = run.fit(self.resume)

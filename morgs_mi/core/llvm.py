@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -54,11 +53,9 @@ def search_folders() -> list[Path]:
     return [*folders, usr / f"{os.uname().machine}-linux-gnu", *sorted(usr.glob("llvm-*/lib"))]
 
 
-def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
-    """Return the libLLVM files in `folders` (default: `search_folders`), newest first, without
-    duplicates.
-    """
-    folders = search_folders() if folders is None else folders
+def find_llvm() -> list[Path]:
+    """Return the libLLVM files in `search_folders`, newest first, without duplicates."""
+    folders = search_folders()
     files = {path.resolve(): path for folder in folders for path in folder.glob("libLLVM*.so*")}
     libraries = [path for path in files.values() if _NAME.fullmatch(path.name)]
     return sorted(libraries, key=lambda path: llvm_major(path) or 0, reverse=True)
@@ -100,19 +97,16 @@ def usable(path: Path) -> bool:
     return major >= SAFE_MAJOR
 
 
-def choose_llvm(
-    choice: str | None = None, folders: Iterable[Path] | None = None
-) -> tuple[Path | None, str]:
+def choose_llvm(choice: str | None = None) -> tuple[Path | None, str]:
     """Return the library to use (None if there is none) and a sentence that describes the problem
     (empty if none).
 
     Args:
         choice: the user's choice, which takes precedence if it is usable.
-        folders: folders to search otherwise, by default `search_folders`.
     """
     if choice and usable(Path(choice)):
         return Path(choice), ""
-    libraries = find_llvm(folders)
+    libraries = find_llvm()
     best = next((path for path in libraries if usable(path)), None)
     if choice:
         rest = f"{best} is used instead." if best else f"No other was found: {REMEDY}."

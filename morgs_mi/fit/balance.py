@@ -76,7 +76,7 @@ def balance_config(config: FitConfig) -> FitConfig:
 
 
 def balance_cameras(
-    problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress | None = None
+    problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress
 ) -> Balance:
     """Return the exposures with which the cameras agree, and whether withheld pixels show that they
     are better.
@@ -87,7 +87,7 @@ def balance_cameras(
         seed: of all random choices.
         progress: of the fits, in one stage.
     """
-    report = (progress or Progress()).of("Balancing cameras")
+    report = progress.of("Balancing cameras")
     how = config.short_fits
     rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
     visible, withheld = withheld_blocks(problem.views, how.width, rng)

@@ -249,11 +249,10 @@ def _add_band(optimizer: Adam, base: Gaussians) -> None:
     coefficients = np.asarray(dr.detach(optimizer["sh_rest"]))
     next_degree = round((coefficients.shape[1] + 1) ** 0.5)
     width = (next_degree + 1) ** 2 - 1
-    value = np.concatenate([coefficients, rest[:, coefficients.shape[1] : width]], axis=1)
     replace_parameter(
         optimizer,
         "sh_rest",
-        value,
+        np.concatenate([coefficients, rest[:, coefficients.shape[1] : width]], axis=1),
         lambda moment: np.pad(moment, [(0, 0), (0, width - coefficients.shape[1]), (0, 0)]),
     )
 

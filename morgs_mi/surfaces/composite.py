@@ -37,7 +37,7 @@ def composite(
     channels: Sequence[str],
     background: Sequence[float] | Jit | None,
     view: SurfaceView,
-    config: RenderConfig | None = None,
+    config: RenderConfig,
 ) -> Columns:
     """Return the channels of splats and surfaces, differentiable in both, each a list of floats
     [P].
@@ -101,7 +101,7 @@ def _in_front(
     gaussians: ActivatedGaussians,
     channels: tuple[str, ...],
     view: SurfaceView,
-    config: RenderConfig | None,
+    config: RenderConfig,
 ) -> Columns | None:
     """Return the blended sums of the splats in front of the surfaces [P], 0 where there are none;
     None: nowhere.

@@ -204,7 +204,7 @@ class SurfaceView:
         pixels: SampledPixels,
         splats: ActivatedGaussians,
         srgb: bool,
-        config: RenderConfig | None = None,
+        config: RenderConfig,
     ) -> SurfaceView | None:
         """Render the surfaces of a scene, or return None if it has neither surfaces nor an
         environment.

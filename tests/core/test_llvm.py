@@ -46,37 +46,41 @@ def test_llvm_major__reads_the_file_name(tmp_path, name, major):
     assert llvm.llvm_major(tmp_path / name) == major
 
 
-def test_llvm_major__follows_links(libraries, tmp_path):
+def test_llvm_major__follows_links(libraries, tmp_path, monkeypatch):
     libraries("libLLVM.so.20.1")
     (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM.so.20.1")
     assert llvm.llvm_major(tmp_path / "libLLVM.so") == 20
-    assert len(llvm.find_llvm([tmp_path])) == 1
+    monkeypatch.setattr(llvm, "search_folders", lambda: [tmp_path])
+    assert len(llvm.find_llvm()) == 1
 
 
 @pytest.mark.usefixtures("old_fails")
-def test_choose_llvm__takes_the_users_choice_if_it_is_usable_or_else_the_newest(libraries):
+def test_choose_llvm__takes_the_users_choice_if_it_is_usable_or_else_the_newest(
+    libraries, monkeypatch
+):
     folders = libraries(
         "libLLVM-9.so.1", "libLLVM.so.19.1", "libLLVM.so.22.1", "libLLVM-15.so.1", "libLLVMx.so"
     )
-    assert [llvm.llvm_major(path) for path in llvm.find_llvm(folders)] == [22, 19, 15, 9]
+    monkeypatch.setattr(llvm, "search_folders", lambda: folders)
+    assert [llvm.llvm_major(path) for path in llvm.find_llvm()] == [22, 19, 15, 9]
     newest = folders[0] / "libLLVM.so.22.1"
     good = folders[0] / "libLLVM.so.19.1"
-    assert llvm.choose_llvm(folders=folders) == (newest, "")
-    assert llvm.choose_llvm(str(good), folders) == (good, "")
-    path, problem = llvm.choose_llvm(str(folders[0] / "libLLVM-15.so.1"), folders)
+    assert llvm.choose_llvm() == (newest, "")
+    assert llvm.choose_llvm(str(good)) == (good, "")
+    path, problem = llvm.choose_llvm(str(folders[0] / "libLLVM-15.so.1"))
     assert path == newest
     assert "libLLVM-15" in problem
     assert "libLLVM.so.22.1 is used instead" in problem
     for usable in (newest, good):
         usable.unlink()
-    path, problem = llvm.choose_llvm(folders=folders)
+    path, problem = llvm.choose_llvm()
     assert path is None
     assert "libLLVM-15.so.1" in problem
     assert "apt-get install libllvm" in problem
 
 
 def test_ensure_llvm__raises_without_cuda_and_warns_with_it(monkeypatch):
-    monkeypatch.setattr(llvm, "find_llvm", lambda folders=None: [])
+    monkeypatch.setattr(llvm, "find_llvm", lambda: [])
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     with pytest.raises(RuntimeError, match="LLVM 17 or newer"):

@@ -123,7 +123,7 @@ def write_ply_files(
     output: str | Path,
     kind: Format,
     frames: Sequence[int],
-    progress: Steps | None = None,
+    progress: Steps,
 ) -> None:
     """Write frames of a stream as PLY files of a format in `PLY`, see `write_each`."""
     is_compressed = kind.name == "compressed.ply"
@@ -138,7 +138,7 @@ def write_each(
     suffix: str,
     write: Callable[[Path, Gaussians], None],
     frames: Sequence[int],
-    progress: Steps | None = None,
+    progress: Steps,
 ) -> None:
     """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file;
     atomically.
@@ -168,8 +168,7 @@ def write_each(
     with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
         for count, (frame, gaussians) in enumerate(chosen, start=1):
             write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
-            if progress is not None:
-                progress(count, len(selection))
+            progress(count, len(selection))
 
 
 def flight(
