@@ -20,10 +20,10 @@ from morgs_mi.evaluate.measures import (
     ImageDistance,
     Motion3D,
     Quality,
-    Speed,
     Variation,
 )
-from morgs_mi.evaluate.results import Evaluation, FrameScores, Sizes, known_mean
+from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
+from morgs_mi.playback.player import playback_speed
 from morgs_mi.playback.streams import open_stream
 
 _UNKNOWN = (None, 0, ())  # Of a frame without a report.
@@ -61,7 +61,7 @@ def evaluate_stream(
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
     fitted = _fitted(stream.path)
-    measures = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
+    measures = [Quality(lpips), Variation(clip), Motion3D(clip)]
     rows = []
     for frame in clip.frames():
         for view in frame.views():
@@ -102,6 +102,9 @@ def evaluate_stream(
                 known_mean([row.num_bytes for row in rows if row.kind == kind])
                 for kind in ("keyframe", "residual")
             ),
+        ),
+        playback=PlaybackTimes(
+            **playback_speed(stream, stream.cameras[clip.views[0]], clip.render)
         ),
         frames=tuple(rows),
         **_merged(measure.result() for measure in measures),

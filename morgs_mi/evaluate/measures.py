@@ -36,9 +36,8 @@ from morgs_mi.evaluate.metrics import (
     unit_pair,
 )
 from morgs_mi.evaluate.motion3d import evaluate_motion
-from morgs_mi.evaluate.results import PlaybackTimes, VariationScores, ViewScores
+from morgs_mi.evaluate.results import VariationScores, ViewScores
 from morgs_mi.method.exposure import follow_exposure
-from morgs_mi.playback.player import playback_speed
 
 REGIONS = ("", "_moving", "_still")
 # Compression flickers: after a hundred frames half the pixels of a real recording have changed
@@ -164,18 +163,6 @@ class Motion3D(Measure):
         opacities = np.asarray(last_state.gaussians.opacities)[last_rows]
         points = tracks.points[:, state.frame - 1], tracks.points[:, state.frame], tracks.ids
         return {"motion_3d": evaluate_motion(old, new - old, opacities, points, views)}
-
-
-class Speed(Measure):
-    """Speed of decoding and rendering the stream on this machine."""
-
-    def __init__(self, clip: ComparedClip) -> None:
-        self._clip = clip
-
-    def result(self) -> dict[str, Any]:
-        clip = self._clip
-        camera = clip.stream.cameras[clip.views[0]]
-        return {"playback": PlaybackTimes(**playback_speed(clip.stream, camera, clip.render))}
 
 
 def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:

@@ -80,8 +80,6 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
         problem: N Gaussians, the key views and their images.
         start: of the motion.
     """
-    if not problem.views:
-        return replace(start, color_change=np.zeros((len(problem.gaussians), 3), np.float32))
     d = start.displacement
     moves = np.any(d, axis=1)
     start_sums = problem.sums_at(d)
@@ -157,7 +155,7 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     if gaussians.logit_confidence is not None:
         confident = np.asarray(gaussians.logit_confidence)[:, None] > 0
         last_motion = np.where(confident, last_motion, 0)
-    if not problem.views or not (d.any() or last_motion.any()):
+    if not (d.any() or last_motion.any()):
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
     rounds = _ROUNDS if near.size else 0
@@ -235,6 +233,8 @@ def initial_motion(
     for name, stage in STARTS.items():
         if getattr(config, name):
             start = stage(problem, start, config)
+        if not views:  # lifted flow alone has a start: no motion
+            break
     logit = start.logit_confidence
     if gaussians.logit_confidence is not None:
         last_logit = np.asarray(gaussians.logit_confidence)

@@ -71,8 +71,6 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         start: of the motion.
         config: settings.
     """
-    if not problem.views:
-        return start
     displacement = start.displacement
     logit = start.logit_confidence
     gaussians = problem.gaussians

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -136,23 +136,17 @@ def _resumed(
     return frames
 
 
-class Refinement(Protocol):
-    """Result of refining the cameras of a capture."""
-
-    def validation(
-        self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
-    ) -> dict[str, Any]:
-        """Return the changes of the cameras and their gain, for the report of the first frame."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A capture that is ready to be fitted."""
 
     #: With enough points, and with refined cameras where the settings ask for them.
     capture: Capture
-    refinement: Refinement | None = None  #: Of the cameras; None if they are the calibration's.
+    #: Returns the changes of the cameras and their gain, for the report of the first frame; None if
+    #: they are the calibration's.
+    validation: (
+        Callable[[Capture, Gaussians, PartialFrame, StreamConfig], dict[str, Any]] | None
+    ) = None
 
     @classmethod
     def of(cls, capture: Capture, config: StreamConfig, progress: Progress) -> Prepared:
@@ -164,7 +158,8 @@ class Prepared:
             return cls(capture)
         stage = progress.of("Refining cameras")
         refine_cameras = extra("camera refinement", "first frame")
-        return cls(*refine_cameras(capture, config.fit, config.render, config.seed, stage))
+        capture, refinement = refine_cameras(capture, config.fit, config.render, config.seed, stage)
+        return cls(capture, refinement.validation)
 
     def completed(
         self,
@@ -181,9 +176,9 @@ class Prepared:
             frame: its images.
             config: settings of the fit.
         """
-        if self.refinement is None or frame.index or gaussians is None:
+        if self.validation is None or frame.index or gaussians is None:
             return report
-        result = self.refinement.validation(self.capture, gaussians, frame, config)
+        result = self.validation(self.capture, gaussians, frame, config)
         return replace(report, validation=report.validation | {"refinement": result})
 
 

@@ -18,7 +18,7 @@ from tests.scenes.ball import opaque_ball, views
 SHIFT = np.float32([0.06, -0.03, 0.02])
 
 
-def start(config):
+def start(config, with_flow=True):
     """Return the start of a ball that goes on moving by `SHIFT`, without any flow."""
     ball = opaque_ball()
     previous_gaussians = replace(
@@ -34,7 +34,7 @@ def start(config):
         np.zeros((*targets[0].image().shape[:2], 2), np.float32),
         np.ones(targets[0].image().shape[:2], bool),
     )
-    flows = {v: FlowObservation(*flow, *flow) for v in active.views}
+    flows = {v: FlowObservation(*flow, *flow) for v in active.views if with_flow}
     return initial_motion(
         previous_gaussians, active, flows, targets, config, np.random.default_rng(0)
     )
@@ -57,3 +57,9 @@ def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch):
     monkeypatch.setattr(cohesion, "KDTree", lambda points: built.append(points) or KDTree(points))
     start(replace(MotionConfig(), search_motion=False))
     assert len(built) == 1
+
+
+def test_initial_motion__has_no_motion_without_flow():
+    still = start(MotionConfig(), with_flow=False)
+    assert not still.displacement.any()
+    assert still.color_change is None

@@ -89,7 +89,6 @@ def test_search_motion__corrects_a_wrong_start(scene):
 def test_search_motion__keeps_a_start_that_explains_the_images(scene):
     right = start_of(SHIFT, 1)
     assert searched(scene, right) is right
-    assert searched((scene[0], {}), right) is right
 
 
 def test_search_motion__keeps_a_part_that_vanished(scene):
