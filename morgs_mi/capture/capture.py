@@ -465,10 +465,7 @@ def _downscaled_cameras(
         )
     cameras = []
     for camera, times, readout in zip(recorded, clips, readouts, strict=True):
-        if downscale != 1:
-            camera = camera.resized(
-                round(camera.width / downscale), round(camera.height / downscale)
-            )
+        size = (round(camera.width / downscale), round(camera.height / downscale))
         delay = times.delay / times.rate
-        cameras.append(replace(camera, delay=delay, readout=readout / times.rate))
+        cameras.append(replace(camera.resized(*size), delay=delay, readout=readout / times.rate))
     return cameras

@@ -14,7 +14,6 @@ from itertools import islice
 import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource, play
-from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
@@ -28,10 +27,9 @@ from morgs_mi.playback.visualise import (
     motion_image,
     to_uint8,
 )
+from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
-
-_ATTRIBUTE_CHANNELS = {row.channel: row.name for row in ATTRIBUTES if row.channel is not None}
 
 MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per
@@ -134,8 +132,8 @@ def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
     """
     attributes = (
         name
-        for name, attribute in _ATTRIBUTE_CHANNELS.items()
-        if getattr(gaussians, attribute) is not None
+        for name, attribute in attribute_channels().items()
+        if getattr(gaussians, attribute.name) is not None
     )
     return ("color", "motion", "depth", *attributes)
 

@@ -35,15 +35,12 @@ def channel_sizes() -> dict[str, int]:
     }
 
 
-def exr_names(channel: str) -> tuple[str, ...]:
-    """Return the EXR names of a channel's floats: NAME.Y for one, NAME.X, NAME.Y, NAME.Z for 2 or
-    3.
-    """
-    size = channel_sizes()[channel]
+def exr_names(channel: str, size: int) -> list[str]:
+    """Return the EXR names of a channel's floats: NAME.Y for one, NAME.X, NAME.Y ... for 2 to 4."""
     if size == 1:
-        return (f"{channel}.Y",)
-    suffixes = "XYZ"[:size] if size <= 3 else range(size)
-    return tuple(f"{channel}.{suffix}" for suffix in suffixes)
+        return [f"{channel}.Y"]
+    suffixes = "XYZW"[:size] if size <= 4 else range(size)
+    return [f"{channel}.{suffix}" for suffix in suffixes]
 
 
 def aov_attributes() -> dict[str, str | None]:

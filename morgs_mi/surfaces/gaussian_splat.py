@@ -21,7 +21,7 @@ from morgs_mi.core.config import check_value
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
 from morgs_mi.core.types import Float, Tensor, Tensors, UInt32
-from morgs_mi.render.channels import aov_attributes, exr_names
+from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
@@ -318,7 +318,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         )
 
     def aov_names(self) -> list[str]:
-        return [channel for name in self.aovs for channel in exr_names(name)]
+        sizes = channel_sizes()
+        return [channel for name in self.aovs for channel in exr_names(name, sizes[name])]
 
     def render(
         self,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
-from morgs_mi.render.channels import aov_attributes, exr_names
+from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
 from morgs_mi.surfaces import gaussian_splat
 
 TEXT = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")
@@ -54,7 +54,7 @@ def test_mitsuba_page__lists_all_channels():
     (row,) = re.findall(r"^\| `aovs` \|.*", TEXT, re.MULTILINE)
     assert set(re.findall(r"`(\w+)` \(", row)) == {*aov_attributes()}
     for channel in aov_attributes():
-        assert all(f"`{name}`" in row for name in exr_names(channel))
+        assert all(f"`{name}`" in row for name in exr_names(channel, channel_sizes()[channel]))
     assert all(
         f"`SHAPE.{name}`" in TEXT for name in aov_attributes().values() if name in BY_ACTIVATED_NAME
     )

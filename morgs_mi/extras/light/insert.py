@@ -47,7 +47,7 @@ from morgs_mi.extras.synth.scene import build_of, failures_in
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import available_channels
-from morgs_mi.render.channels import exr_names
+from morgs_mi.render.channels import channel_sizes
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.surfaces.surface_view import lights, rays_for, shared_scene, traced
 
@@ -231,7 +231,7 @@ def _render(
         images = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}
         first = 4
         for name in aovs:
-            size = len(exr_names(name))
+            size = channel_sizes()[name]
             images[name] = image[..., first : first + size]
             first += size
         if "surfaces" in channels:

@@ -16,6 +16,7 @@ from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.visualise import side_by_side, to_uint8, write_png
+from morgs_mi.render.channels import exr_names
 
 # Index and channels [H, W, C] by name.
 _Frame = tuple[int, Arrays]
@@ -109,10 +110,7 @@ def _exr_names(channel: str, components: int) -> list[str]:
         return ["A"]
     if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
         return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
-    if components == 1:
-        return [f"{channel}.Y"]
-    suffixes = "XYZW"[:components] if components <= 4 else range(components)
-    return [f"{channel}.{suffix}" for suffix in suffixes]
+    return exr_names(channel, components)
 
 
 def pad_to_even(image: np.ndarray) -> np.ndarray:
