@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import Positional
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
@@ -25,11 +25,11 @@ class Accuracy:
 
     source: Positional[Path]
     """File of Gaussians, .ply, .compressed.ply or .splat, folder of a fit, or a stream file."""
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.png")] = None
+    output: Annotated[Positional[Path | None], place("FILE.png")] = None
     """Plot, beside which a .json has all results; by default OUT/NAME-accuracy.png. Needs the extra
     plots.
     """
-    camera: Annotated[str | None, DisallowNone, optional("CAMERA")] = None
+    camera: Annotated[str | None, optional("CAMERA")] = None
     """Camera by index or name; by default the first one, for a file of Gaussians the one with most
     detail in view.
     """

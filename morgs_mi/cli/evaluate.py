@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import Positional
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_next, print_result, print_table, print_warning, progress
@@ -26,13 +26,13 @@ class Eval:
 
     source: Positional[Path]
     """Folder of a fit, or a stream file."""
-    capture: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
+    capture: Annotated[Path | None, optional("FOLDER")] = None
     """Capture that was fitted, if it has moved since the fit."""
     any_recording: Flag = False
     """Compare with CAPTURE even if it is another recording by the same cameras."""
-    json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
+    json: Annotated[Path | None, optional("FILE.json")] = None
     """File for all results; - prints them instead of the tables."""
-    lpips: Annotated[Path | None, DisallowNone, optional("FILE.onnx")] = None
+    lpips: Annotated[Path | None, optional("FILE.onnx")] = None
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package
     includes none.
     """

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import quantity
 from morgs_mi.cli.settings import (
@@ -43,11 +43,11 @@ class Ply(ExportKind):
     capture's axes.
     """
 
-    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
+    output: Annotated[Positional[Path | None], place("FOLDER")] = None
     """New folder for 0000.ply, ..., or FILE.ply for one frame, by default OUT/ply; a folder whose
     name ends in compressed-ply, or FILE.compressed.ply, for PlayCanvas' layout.
     """
-    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+    frames: Annotated[str | None, FRAMES] = None
 
     formats = PLY
 
@@ -63,13 +63,13 @@ class Ply(ExportKind):
 class Flight(ExportKind):
     """Render a stream along a moving camera into an mp4."""
 
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.mp4")] = None
+    output: Annotated[Positional[Path | None], place("FILE.mp4")] = None
     """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
     path: Annotated[str, arg(metavar="PATH")] = "between"
     """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file
     (docs/exports.md).
     """
-    seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
+    seconds: float | None = None
     """Duration in seconds; by default the duration in the JSON file, or of the clip, which is
     repeated up to LEAST_SECONDS.
     """
@@ -78,13 +78,13 @@ class Flight(ExportKind):
     """
     back_and_forth: Flag = False
     """Play every second time backwards, instead of restarting at the first frame."""
-    degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
+    degrees: float | None = None
     """Angle of an orbit, 1 to 360; below 360 the camera swings to both sides. By default the extent
     of the rig.
     """
-    freeze: Annotated[int | None, DisallowNone, optional("FRAME")] = None
+    freeze: Annotated[int | None, optional("FRAME")] = None
     """Frame at which time stands still; by default the clip plays and repeats."""
-    width: Annotated[int | None, DisallowNone, optional("INT")] = None
+    width: int | None = None
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[ChannelName, ...] = ("color",)
     """Channels to render, side by side."""
@@ -127,10 +127,10 @@ class Flight(ExportKind):
 class Web(ExportKind):
     """Write a web page that plays the stream without a server, or a folder for a server."""
 
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
+    output: Annotated[Positional[Path | None], place("FILE.html")] = None
     """FILE.html, or a new folder with the page, the stream and a module for three.js, for hosting;
     by default OUT/player.html or OUT/web."""
-    title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
+    title: Annotated[str | None, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
     background: Background = None
 

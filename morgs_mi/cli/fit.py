@@ -9,7 +9,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional
 
 from morgs_mi.cli.console import print_next, print_result, progress
 from morgs_mi.cli.settings import (
@@ -39,13 +39,13 @@ class Fit:
     The file overrides the preset; options override both.
     """
 
-    capture: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
+    capture: Positional[Path | None] = None
     """Folder of the capture."""
-    out: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
+    out: Positional[Path | None] = None
     """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced
     without --resume.
     """
-    frames: Annotated[int | None, DisallowNone, optional("INT", "(default: all)")] = None
+    frames: Annotated[int | None, optional("INT", "(default: all)")] = None
     """Number of frames to fit, from the first one."""
     downscale: float = 1
     """Factor by which the images are reduced; 2 halves width and height."""
@@ -59,10 +59,10 @@ class Fit:
     """Print all settings as TOML and exit."""
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
-    chunks: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
+    chunks: Annotated[int | None, optional("INT", "(default: 1)")] = None
     """Number of parts of the recording that are fitted side by side, by the extra cluster; each
     begins with a keyframe."""
-    scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS")] = None
+    scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/cluster.md)."""
     reproducible: Flag = False
     """Sum in a fixed order: on a CPU every fit does; a GPU cannot."""

@@ -116,6 +116,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             args=args,
             config=(
                 tyro.conf.CascadeSubcommandArgs,
+                tyro.conf.DisallowNone,
                 tyro.conf.OmitSubcommandPrefixes,
                 tyro.conf.PositionalMetavarFromFieldName,
             ),
@@ -164,7 +165,7 @@ def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:
         blocks = {"": [], **blocks}
         title = ""
         # No value is no default.
-        content = re.sub(r"\s+\(default:\s*(None)?\)", "", text.getvalue())
+        content = re.sub(r"\s+\(default:\s*(None|False)?\)", "", text.getvalue())
         for line in map(str.rstrip, content.splitlines()):
             if not line.startswith("   "):
                 title = titles.get(line.removeprefix("  --").partition(" ")[0], "")

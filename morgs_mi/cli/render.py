@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result, progress, quantity
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, options
@@ -32,42 +32,39 @@ class Render:
     """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     output: Annotated[
         Positional[Path | None],
-        DisallowNone,
-        arg(metavar="[FILE_OR_FOLDER]", help_behavior_hint=""),
+        arg(metavar="[FILE_OR_FOLDER]"),
     ] = None
     """FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for
     multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels,
     confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, with
     the name of the camera or the path.
     """
-    camera: Annotated[str | None, DisallowNone, optional("CAMERA")] = None
+    camera: Annotated[str | None, optional("CAMERA")] = None
     """Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A
     file of Gaussians has front, front-right, right, back-right, back, back-left, left and
     front-left, or the cameras of its training. By default, a single image is seen by the first
     camera; for a file, by the one with most detail in view.
     """
-    path: Annotated[str | None, DisallowNone, optional("PATH")] = None
+    path: Annotated[str | None, optional("PATH")] = None
     """Camera path, instead of a camera: orbit (around the scene, the default), between (through
     the cameras), or a JSON file (docs/exports.md). `morgs-mi export video` has more options.
     """
-    degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
+    degrees: float | None = None
     """Angle of an orbit, 1 to 360; by default the extent of the rig, and 60 for a file of
     Gaussians.
     """
-    width: Annotated[int | None, DisallowNone, optional("INT")] = None
+    width: int | None = None
     """Width of the images; by default that of the camera."""
-    channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...")] = None
+    channels: Annotated[tuple[ChannelName, ...] | None, optional("NAME ...")] = None
     """Channels to render, side by side: color, motion, confidence, depth, alpha. By default color,
     and for EXR files all that the stream stores.
     """
-    insert: Annotated[Path | None, DisallowNone, optional("FILE")] = None
+    insert: Annotated[Path | None, optional("FILE")] = None
     """Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function
     build(frame, time) that returns the entries of a scene. Without emitters it is lit by the
     stream.
     """
-    at: Annotated[tuple[int, ...] | None, DisallowNone, optional("FRAME ...", "(default: all)")] = (
-        None
-    )
+    at: Annotated[tuple[int, ...] | None, optional("FRAME ...", "(default: all)")] = None
     """Frames to render with an inserted scene."""
     samples: Annotated[int, arg(metavar="INT")] = 16
     """Samples per pixel of an inserted scene."""

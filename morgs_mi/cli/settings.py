@@ -10,7 +10,7 @@ from operator import or_
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
 
-from tyro.conf import DisallowNone, FlagCreatePairsOff, arg, subcommand
+from tyro.conf import FlagCreatePairsOff, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
@@ -43,9 +43,9 @@ ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
 # Whether something is estimated.
 Estimation = Literal["off", "auto", "on"]
 # A switch that is off by default.
-Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+Flag = Annotated[bool, FlagCreatePairsOff]
 # Names of cameras, none by default.
-Without = Annotated[tuple[str, ...], arg(metavar="CAMERA ...", help_behavior_hint="")]
+Without = Annotated[tuple[str, ...], arg(metavar="CAMERA ...")]
 # Names or indices of held-out cameras.
 HeldOut = Annotated[tuple[str, ...], arg(metavar="CAMERA ...")]
 
@@ -79,12 +79,9 @@ def fill_help() -> None:
             command.__annotations__[name] = annotation
 
 
-def optional(metavar: str, hint: str = "") -> Any:
-    """Return the help of an option that is None where it is not given, without the word None.
-
-    Args:
-        metavar: name of the value.
-        hint: text after the help.
+def optional(metavar: str, hint: str | None = None) -> Any:
+    """Return the help of an option that may be missing: the name of its value, and the text after
+    the help, by default its default.
     """
     return arg(metavar=metavar, help_behavior_hint=hint)
 
@@ -93,15 +90,13 @@ _STOPS = (
     "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a "
     "recording of 8 bits."
 )
-DisplayExposure = Annotated[
-    float | None, DisallowNone, arg(metavar="STOPS", help_behavior_hint="", help=_STOPS)
-]
+DisplayExposure = Annotated[float | None, arg(metavar="STOPS", help=_STOPS)]
 """Option of the commands that render a stream."""
 
 
 def place(metavar: str) -> Any:
     """Return the help of a positional argument for an output that has a default place."""
-    return arg(metavar=f"[{metavar}]", help_behavior_hint="")
+    return arg(metavar=f"[{metavar}]")
 
 
 def setting(option: str, config: StreamConfig | None = None, metavar: str = "") -> Any:
@@ -168,9 +163,7 @@ class Reading:
 
     trim: Flag = False
     """Use the timestamps that all clips contain, at their lowest frame rate."""
-    offset: Annotated[dict[str, float], arg(help_behavior_hint=""), _OFFSETS] = field(
-        default_factory=dict
-    )
+    offset: Annotated[dict[str, float], _OFFSETS] = field(default_factory=dict)
     """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it
     began later.
     """
@@ -289,4 +282,4 @@ class Settings:
 
 # As fields of a command: options without a prefix. None means "not given", so it cannot be passed.
 GivenReading = Annotated[Reading, arg(name="")]
-GivenSettings = Annotated[Settings, arg(name=""), DisallowNone]
+GivenSettings = Annotated[Settings, arg(name="")]

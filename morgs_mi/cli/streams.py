@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import options
@@ -22,19 +22,17 @@ _DROP = (
     "Leave out the Gaussians of a file whose numbers are not finite or absurdly large, however "
     "many they are."
 )
-DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_hint="")]
+DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP)]
 """Option of the commands that read files of Gaussians."""
 _SPAN = "Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."
-FRAMES = arg(metavar="FRAMES", help_behavior_hint="", help=_SPAN)
+FRAMES = arg(metavar="FRAMES", help=_SPAN)
 
 
 _BACKGROUND = (
     "Colour behind the Gaussians: black, grey, white or #rrggbb; by default the fit's, which is "
     "usually black."
 )
-Background = Annotated[
-    str | None, DisallowNone, arg(metavar="COLOR", help_behavior_hint="", help=_BACKGROUND)
-]
+Background = Annotated[str | None, arg(metavar="COLOR", help=_BACKGROUND)]
 """Option of the commands that draw a stream."""
 _COLORS = {"black": "#000000", "grey": "#808080", "white": "#ffffff"}
 

@@ -6,7 +6,7 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
 from morgs_mi.cli.settings import optional, options
@@ -29,7 +29,7 @@ class View:
     """Open the page in the browser of this machine."""
     follow: bool = False
     """Begin at the newest frame."""
-    capture: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
+    capture: Annotated[Path | None, optional("FOLDER")] = None
     """Folder of the capture with the recorded images; by default the one that was fitted."""
     drop_invalid: DropInvalid = False
 

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import DisallowNone, FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
@@ -70,7 +70,7 @@ class Info:
 
     capture: Annotated[Positional[Path], arg(metavar="SOURCE")]
     """Folder of a capture or a fit, a stream file, or a file of Gaussians."""
-    plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
+    plot: Annotated[Path | None, optional("FILE")] = None
     """File for a plot of the rig, .png, .jpg, .svg or .pdf."""
     check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
     """Check the poses against feature matches between the views of the first frame."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_next, print_result, print_table, progress
 from morgs_mi.cli.settings import (
@@ -43,7 +43,7 @@ class Demo:
     """Folder for all results; those of an earlier demo are replaced."""
     scene: Annotated[str, arg(metavar="SCENE")] = _DEFAULT.scene
     """Name of a scene (spheres, arm, thin, flicker, random) or its Python file."""
-    cameras: Annotated[int | None, DisallowNone] = _DEFAULT.clip.cameras
+    cameras: int | None = _DEFAULT.clip.cameras
     """Number of cameras, the held-out cam00 included."""
     frames: int = _DEFAULT.clip.frames
     """Number of frames per camera."""
@@ -51,11 +51,11 @@ class Demo:
     """Width of the images in pixels, even."""
     height: int = _DEFAULT.clip.height
     """Height of the images in pixels, even."""
-    spp: Annotated[int | None, DisallowNone] = _DEFAULT.clip.spp
+    spp: int | None = _DEFAULT.clip.spp
     """Samples per pixel."""
-    seed: Annotated[int | None, DisallowNone, setting("seed", _DEFAULT.stream)] = None
+    seed: Annotated[int | None, setting("seed", _DEFAULT.stream)] = None
     """Seed of the clip and the fit."""
-    config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
+    config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with settings of the fit, as `morgs-mi fit --print-config` writes it."""
 
     def run(self) -> None:

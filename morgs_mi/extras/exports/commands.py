@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import Positional
 
 from morgs_mi.cli.console import quantity
 from morgs_mi.cli.settings import (
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 class Gltf(ExportKind):
     """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
 
-    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
+    output: Annotated[Positional[Path | None], place("FOLDER")] = None
     """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
-    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+    frames: Annotated[str | None, FRAMES] = None
 
     formats = GLTF
 
@@ -51,9 +51,9 @@ class Usd(ExportKind):
     y up.
     """
 
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
+    output: Annotated[Positional[Path | None], place("FILE")] = None
     """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
-    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+    frames: Annotated[str | None, FRAMES] = None
     half: Flag = False
     """Half precision of all attributes but the positions."""
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_next, print_result, progress
@@ -26,7 +26,7 @@ class Import:
     # One list, as for `cp`: the parser cannot split two of them where options follow.
     paths: Annotated[
         Positional[tuple[Path, ...]],
-        arg(metavar="FRAMES [FRAMES ...] OUT", help_behavior_hint=""),
+        arg(metavar="FRAMES [FRAMES ...] OUT"),
     ] = ()
     """Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the
     order of the frames. Last, OUT: a folder for stream.morgs, or a new file whose name ends in
@@ -36,9 +36,9 @@ class Import:
     """Frames per second."""
     axes: Annotated[Axes, arg(metavar="NAME")] = "y-down"
     """Direction that is up in the files: y-down, y-up or z-up."""
-    quality: Annotated[float | None, DisallowNone, setting("quality")] = None
+    quality: Annotated[float | None, setting("quality")] = None
     """Precision of the stream; 2 halves all errors."""
-    target_size: Annotated[int | None, DisallowNone, setting("target_size")] = None
+    target_size: Annotated[int | None, setting("target_size")] = None
     """Most bytes of a frame that continues the one before; 0: no limit."""
     keyframe_interval: Annotated[int, arg(metavar="INT")] = CodecConfig().keyframe_interval
     """Frames between two keyframes; 0: only where they are needed."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import mitsuba as mi
 import numpy as np
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_next, print_result, print_warning, progress
 from morgs_mi.cli.settings import (
@@ -55,16 +55,14 @@ class Live:
     """Folder for stream.morgs, capture.json and report.json, and for the fitted images in its
     folder capture.
     """
-    camera: Annotated[tuple[str, ...], arg(metavar="SOURCE ...", help_behavior_hint="")] = ()
+    camera: Annotated[tuple[str, ...], arg(metavar="SOURCE ...")] = ()
     """Per camera its number, a URL or a video."""
-    live: Annotated[LiveConfig, arg(name=""), DisallowNone] = field(default_factory=LiveConfig)
+    live: Annotated[LiveConfig, arg(name="")] = field(default_factory=LiveConfig)
     view: Flag = False
     """Show the stream in the viewer, which follows it."""
     browser: bool = True
     """Open the viewer in the browser of this machine."""
-    settings: Annotated[LiveSettings, arg(name=""), DisallowNone] = field(
-        default_factory=LiveSettings
-    )
+    settings: Annotated[LiveSettings, arg(name="")] = field(default_factory=LiveSettings)
 
     def run(self) -> None:
         from morgs_mi.core.files import PROVISIONAL

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import Positional
 
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import (
@@ -54,7 +54,7 @@ class Sweep:
     """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0
     of six or more.
     """
-    config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
+    config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as `fit --print-config` writes it."""
 
     def run(self) -> None:

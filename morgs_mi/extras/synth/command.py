@@ -6,7 +6,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import DisallowNone, OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from morgs_mi.cli.console import print_next, print_result, progress
 from morgs_mi.cli.settings import (
@@ -26,7 +26,7 @@ class Synth:
     """
     out: Positional[Path]
     """New folder for the capture."""
-    config: Annotated[SynthConfig, arg(name=""), OmitArgPrefixes, DisallowNone] = field(
+    config: Annotated[SynthConfig, arg(name=""), OmitArgPrefixes] = field(
         default_factory=SynthConfig
     )
     overwrite: Flag = False
