@@ -13,16 +13,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Tensor, UInt32
-from morgs_mi.render.backend import elements
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.splat_rays import SplatRays
 
@@ -33,9 +30,6 @@ Crop = tuple[int, int, int, int]
 
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
-# Rays of the grid that are cast in every pixel, and the others, row by row.
-_FIRST = (1, 5, 6)
-_OTHERS = (0, 2, 3, 4, 7, 8)
 
 
 def rays_for(
@@ -168,12 +162,6 @@ class SampledPixels:
         crop = dict(zip(names, self.crop, strict=True))
         return mi.load_dict({**self.camera.sensor(pixel_format="rgba", **crop), **more})
 
-    def samples(self) -> int:
-        """Return the samples per pixel, which some samplers round up."""
-        sampler = self.template.sampler().clone()
-        sampler.set_sample_count(self.spp or sampler.sample_count())
-        return sampler.sample_count()
-
 
 @dataclass(frozen=True)
 class SurfaceView:
@@ -227,9 +215,7 @@ class SurfaceView:
         sensor = pixels.sensor()
         rays = rays_for(integrator, splats, config)
         with dr.suspend_grad(), traced(integrator, rays, srgb):
-            image = mi.TensorXf(
-                integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples())
-            )
+            image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.spp))
             if image.shape[2] < 3:
                 raise ValueError(
                     "gaussian_splat: `surfaces` must be an integrator of colours, got one of "
@@ -250,7 +236,7 @@ class SurfaceView:
             return
         with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
             tangent = self.integrator.render_forward(
-                self.scene, params, self.sensor, seed=self.pixels.seed, spp=self.pixels.samples()
+                self.scene, params, self.sensor, seed=self.pixels.seed, spp=self.pixels.spp
             )
         dr.set_grad(self.image, tangent)
         values = self._attached_environment()
@@ -270,7 +256,7 @@ class SurfaceView:
         grad = dr.grad(self.image)
         with traced(self.integrator, self.splats, self.srgb):
             self.integrator.render_backward(
-                self.scene, params, grad, self.sensor, seed=seed, spp=self.pixels.samples()
+                self.scene, params, grad, self.sensor, seed=seed, spp=self.pixels.spp
             )
         values = self._attached_environment()
         if values is not None:
@@ -310,9 +296,6 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
     """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a
     regular grid.
 
-    Three rays, one in each row and column of the grid, decide where all are cast: where they or the
-    next pixels differ.
-
     Args:
         scene: the surfaces.
         sensor: a camera's sensor, with a film of the pixels of `crop`.
@@ -332,37 +315,16 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
-    def cast(pixel: UInt32, grid: tuple[int, ...]) -> tuple[Float, Float]:
-        """Return the number of hits of some rays of the grid in pixels, and the sum of their
-        depths.
-        """
-        cells = mi.UInt32(grid)
-        end = dr.opaque(mi.UInt32, len(grid))
+    def step(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+        rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
+        intersection = scene.ray_intersect_preliminary(rays, coherent=True)
+        hit = intersection.is_valid()
+        z = (to_camera @ rays(dr.select(hit, intersection.t, 0))).z
+        return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
 
-        def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
-            k = elements(cells, i)
-            rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
-            intersection = scene.ray_intersect_preliminary(rays, coherent=True)
-            hit = intersection.is_valid()
-            z = (to_camera @ rays(dr.select(hit, intersection.t, 0))).z
-            return i + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
-
-        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-        return dr.while_loop(state, lambda i, *_: i < end, step, label="coverage")[1:]
-
-    count, total = cast(pixel, _FIRST)
-    rays = dr.full(mi.Float, len(_FIRST), across * down)
-    dr.eval(count, total, rays)
-    counts = np.asarray(count).reshape(down, across)
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    differs = cv2.dilate(counts, cross) != cv2.erode(counts, cross, borderValue=0)
-    edge = np.flatnonzero(differs | (counts % len(_FIRST) > 0))
-    if len(edge):
-        edge = from_numpy(mi.UInt32, edge)
-        more, deeper = cast(elements(pixel, edge), _OTHERS)
-        for target, values in ((count, more), (total, deeper), (rays, mi.Float(len(_OTHERS)))):
-            dr.scatter_add(target, values, edge)
-    dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, step, label="coverage")
+    dr.scatter(coverage, count / _GRID**2, pixel, mode=dr.ReduceMode.Permute)
     dr.scatter(
         depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute
     )
