@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from morgs_mi.core.checks import valid_pixels
+from morgs_mi.core.checks import check_mask, valid_pixels
 from morgs_mi.core.color_space import decode_light, unit_values
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.evaluate.results import VariationScores
@@ -144,10 +144,8 @@ def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | Non
         mask: [H, W] bool, the pixels that count; the result is NaN if there are none.
 
     Raises:
-        ValueError: the sizes differ or the last axis is not 2.
+        ValueError: the sizes differ.
     """
-    if motion.ndim != 3 or motion.shape[2] != 2:
-        raise ValueError(f"endpoint_error(): `motion` must be [H, W, 2], got {motion.shape}.")
     _check("endpoint_error", motion, truth, mask)
     error = np.linalg.norm(np.asarray(motion, np.float64) - truth, axis=-1)
     return mean_over(error, mask)
@@ -201,10 +199,8 @@ def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | N
             f"{name}(): both images must have one size, got {shape} and {np.shape(truth)}; resize "
             "one first."
         )
-    if mask is not None and (mask.shape != shape[:2] or mask.dtype != bool):
-        raise ValueError(
-            f"{name}(): `mask` must be bool {shape[:2]}, got {mask.dtype} {mask.shape}."
-        )
+    if mask is not None:
+        check_mask(f"{name}()", mask, *shape[:2])
 
 
 _CHANGE_WINDOW = 5

@@ -62,7 +62,7 @@ class Balance:
         return f"The cameras stay as recorded: balanced ones are no clear gain, {scores}."
 
 
-def balance_config(config: FitConfig) -> FitConfig:
+def short_fit_config(config: FitConfig) -> FitConfig:
     """Return the settings of the short fits, without view-dependent colours and density control."""
     how = config.short_fits
     return replace(
@@ -82,7 +82,7 @@ def balance_cameras(
     are better.
 
     Args:
-        problem: the data of the first frame, with a start as for `balance_config`.
+        problem: the data of the first frame, with a start as for `short_fit_config`.
         config: of the fit; `exposure` "on" takes the exposures in any case.
         seed: of all random choices.
         progress: of the fits, in one stage.
@@ -91,7 +91,7 @@ def balance_cameras(
     how = config.short_fits
     rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
     visible, withheld = withheld_blocks(problem.views, how.width, rng)
-    short_config = balance_config(config)
+    short_config = short_fit_config(config)
     steps = short_config.planned_steps
     count = 0
 

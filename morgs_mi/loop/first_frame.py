@@ -18,7 +18,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.balance import balance_cameras, balance_config
+from morgs_mi.fit.balance import balance_cameras, short_fit_config
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
@@ -157,7 +157,7 @@ def _balanced(
     entry: dict[str, Any] = {}
     if len(images) > 1:
         rng = rng_of(config.seed, Stream.BALANCED_POINTS)
-        fit = balance_config(config.fit)
+        fit = short_fit_config(config.fit)
         cloud = setup.points, setup.point_colors
         problem = FirstFrameProblem.of(views_of(setup, images), cloud, fit, config.render, rng)
         balance = balance_cameras(problem, config.fit, config.seed, progress)

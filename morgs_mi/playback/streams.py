@@ -14,6 +14,7 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.checks import errors_at
 from morgs_mi.core.files import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
@@ -60,10 +61,8 @@ class SplatFile(FrameSource):
         self.path = path
         self.fps = 30.0
         self.metadata = {"num_frames": 1, DEFAULT_RIG: not trained}
-        try:
+        with errors_at(str(path)):
             self.cameras = trained or default_rig([gaussians])
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
         motion = np.zeros((len(gaussians), 3), np.float32)
         ids = np.arange(len(gaussians), dtype=np.uint32)
         self._state = FrameState(0, ids, replace(gaussians, motion=motion))

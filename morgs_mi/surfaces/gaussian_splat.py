@@ -15,7 +15,7 @@ import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, shape_attribute_widths
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import bounded
+from morgs_mi.core.checks import bounded, errors_at
 from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.config import check_value
 from morgs_mi.core.gaussians import tensor_rows
@@ -285,10 +285,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             if name in props:
                 check_value("gaussian_splat", name, props[name], kind)
         self.srgb_primitives = props.get("srgb_primitives", True)
-        try:
+        with errors_at("gaussian_splat"):
             self.config = RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
-        except ValueError as error:
-            raise ValueError(f"gaussian_splat: {error}") from None
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
         self.surfaces = props.get("surfaces", None)

@@ -10,7 +10,7 @@ from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.rig import scene_extent
-from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
+from morgs_mi.fit.balance import Balance, balance_cameras, short_fit_config
 from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import View
@@ -89,10 +89,10 @@ def test_balance_cameras__judges_by_withheld_pixels(monkeypatch):
     )
 
 
-def test_balance_config__takes_at_most_a_quarter_of_the_steps_of_the_first_frame():
-    assert balance_config(FIT).first_frame_steps == 100
-    assert balance_config(replace(FIT, first_frame_steps=40)).first_frame_steps == 10
-    assert balance_config(replace(FIT, first_frame_steps=1)).first_frame_steps == 1
+def test_short_fit_config__takes_at_most_a_quarter_of_the_steps_of_the_first_frame():
+    assert short_fit_config(FIT).first_frame_steps == 100
+    assert short_fit_config(replace(FIT, first_frame_steps=40)).first_frame_steps == 10
+    assert short_fit_config(replace(FIT, first_frame_steps=1)).first_frame_steps == 1
 
 
 @pytest.mark.slow

@@ -22,7 +22,6 @@ from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cv2
 import numpy as np
 from annotated_types import Ge, Lt
 
@@ -41,6 +40,7 @@ from morgs_mi.core.checks import few, require, valid_pixels
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges
 from morgs_mi.core.files import atomic_path
+from morgs_mi.core.png import png_bytes
 from morgs_mi.core.progress import Report
 from morgs_mi.core.types import Arrays
 from morgs_mi.extras.calibration.checks.mistakes import duplicate_poses
@@ -355,14 +355,15 @@ def match_views(
     (scratch / _IMAGES).mkdir()
     names_by_size: dict[tuple[int, ...], list[str]] = {}
     for name, image in images.items():
-        _write_png(scratch / _IMAGES / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        (scratch / _IMAGES / f"{name}.png").write_bytes(png_bytes(image))
         names_by_size.setdefault(image.shape[:2], []).append(f"{name}.png")
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     if masks:
         (scratch / _MASKS).mkdir()
         for name, image in images.items():  # COLMAP needs a mask for every image
             opaque = valid_pixels(masks.get(name), image.shape)
-            _write_png(scratch / _MASKS / f"{name}.png.png", 255 * opaque.astype(np.uint8))
+            image_of_mask = np.repeat(255 * opaque.astype(np.uint8)[..., None], 3, axis=2)
+            (scratch / _MASKS / f"{name}.png.png").write_bytes(png_bytes(image_of_mask))
         reader.mask_path = scratch / _MASKS
     pycolmap.set_random_seed(config.seed)
     database = scratch / _DATABASE
@@ -514,7 +515,3 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = level
-
-
-def _write_png(file: Path, image: np.ndarray) -> None:
-    file.write_bytes(cv2.imencode(".png", image)[1].tobytes())

@@ -59,6 +59,7 @@ from morgs_mi.extras.calibration.offset_equations import (
     gradient_products,
     image_gradient,
 )
+from morgs_mi.fit.balance import short_fit_config
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
@@ -412,23 +413,14 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
 def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
     """Return the settings of a short fit; a later one continues with half the steps and lower
     rates.
-
-    It has no view-dependent colours, which would hide wrong poses.
     """
-    how = config.short_fits
+    steps = config.short_fits.steps
     rates = config.first_frame_rates
     if is_later:
+        steps = steps // 2
         factors = _LATER_RATES.items()
         rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in factors})
-    return replace(
-        config,
-        sh_degree=0,
-        num_gaussians=how.gaussians,
-        first_frame_steps=how.steps // 2 if is_later else how.steps,
-        first_frame_rates=rates,
-        dropout=0.0,
-        density=replace(config.density, rounds=0),
-    )
+    return replace(short_fit_config(config), first_frame_steps=steps, first_frame_rates=rates)
 
 
 def _joint_step(

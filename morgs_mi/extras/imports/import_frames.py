@@ -26,7 +26,7 @@ from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number, require
+from morgs_mi.core.checks import check_number, errors_at, require
 from morgs_mi.core.files import STREAM, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
@@ -97,12 +97,10 @@ def import_frames(
             f"{path}: expected a new stream, got a file that exists; remove it, or name another."
         )
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
-    try:
-        cameras = default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
-    except ValueError as error:
-        if any(str(error).startswith(f"{path}: ") for path in paths):
-            raise
-        raise ValueError(f"{paths[0].parent}: {error}") from None
+    frames_in_view = [read_splats(paths[t], most_invalid) for t in in_view]
+    with errors_at(str(paths[0].parent)):
+        cameras = default_rig(frames_in_view, axes)
+    del frames_in_view
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     frames = (read_splats(source, most_invalid) for source in paths)

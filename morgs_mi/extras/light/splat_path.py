@@ -86,13 +86,6 @@ class SplatPathIntegrator(RBIntegrator):
             if name in props:
                 check_value("splat_path", name, props[name], kind)
         super().__init__(props)
-        require(
-            mi.is_rgb,
-            "splat_path",
-            "expected a variant such as 'llvm_ad_rgb'",
-            repr(mi.variant()),
-            "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours",
-        )
         self.clipped = float(props.get("clipped", CLIPPED))
         self.splats: SplatRays | None = None
         self.srgb = True
