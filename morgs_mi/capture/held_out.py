@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.core.checks import view_index
 from morgs_mi.core.files import CAPTURE
 
 TestViews = int | str | Sequence[int | str] | None
@@ -69,15 +70,5 @@ def _indices(place: Path, views: TestViews, names: Sequence[str]) -> tuple[int, 
     """Return the ascending indices of cameras; `place` is where they were requested."""
     if views is None:
         return ()
-    indices = set()
-    for view in views if isinstance(views, list | tuple) else [views]:
-        if view in names:
-            indices.add(names.index(view))
-        elif str(view).isdecimal() and int(str(view)) < len(names):
-            indices.add(int(str(view)))
-        else:
-            raise ValueError(
-                f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "
-                f"{', '.join(names)}, or none, got {view}."
-            )
-    return tuple(sorted(indices))
+    some = views if isinstance(views, list | tuple) else [views]
+    return tuple(sorted({view_index(str(place), "`test_view`", view, names) for view in some}))

@@ -125,6 +125,21 @@ def valid_pixels(mask: np.ndarray | None, shape: Sequence[int]) -> np.ndarray:
     return np.ones(shape[:2], bool) if mask is None else mask
 
 
+def view_index(place: str, setting: str, view: Any, names: Sequence[str]) -> int:
+    """Return the index of a view that a setting gives by its name, or by its index.
+
+    Raises:
+        ValueError: there is no such view.
+    """
+    index = names.index(view) if view in names else view
+    if str(index).isdecimal() and int(index) < len(names):
+        return int(index)
+    raise ValueError(
+        f"{place}: {setting} must be an index in 0..{len(names) - 1} or one of {', '.join(names)}, "
+        f"got {view!r}."
+    )
+
+
 def few(names: Sequence[Any] | np.ndarray, most: int = 10) -> str:
     """Return the first of some names in words."""
     rest = len(names) - most

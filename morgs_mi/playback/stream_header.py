@@ -20,7 +20,7 @@ from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import bounded, check_number, numbers
+from morgs_mi.core.checks import bounded, check_number, numbers, view_index
 from morgs_mi.core.config import Config, apply_values, types_of
 from morgs_mi.core.files import CAPTURE, STREAM
 from morgs_mi.render.render_config import RenderConfig
@@ -54,13 +54,7 @@ def find_camera(stream: FrameSource, camera: int | str) -> Camera:
         ValueError: the rig has no such camera.
     """
     names = [view.name for view in stream.cameras]
-    index = names.index(camera) if camera in names else camera
-    if str(index).isdecimal() and int(index) < len(names):
-        return stream.cameras[int(index)]
-    raise ValueError(
-        f"{stream.path}: the camera must be an index in 0..{len(names) - 1} or one of "
-        f"{', '.join(names)}, got {camera!r}."
-    )
+    return stream.cameras[view_index(str(stream.path), "the camera", camera, names)]
 
 
 def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTruth | None:

@@ -89,7 +89,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
         (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
         (
             ["--hold-out", "3"],
-            ("--hold-out must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3"),
+            ("--hold-out must be an index in 0..2 or one of cam0, cam1, cam2", "got '3'"),
         ),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
         (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
