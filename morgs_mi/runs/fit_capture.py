@@ -14,6 +14,7 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.points import dense_points, match_capture
 from morgs_mi.codec.container import Packet
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.extras import extra
 from morgs_mi.core.files import locked_folder
 from morgs_mi.core.gaussians import Gaussians
@@ -29,6 +30,7 @@ from morgs_mi.runs.fit_files import (
     Recording,
     check_outputs,
     interrupted_fit,
+    read_reports,
     stream_metadata,
 )
 from morgs_mi.stream_loop import StreamLoop
@@ -180,6 +182,19 @@ class Prepared:
             return report
         result = self.validation(self.capture, gaussians, frame, config)
         return replace(report, validation=report.validation | {"refinement": result})
+
+
+def begin_as(source: Path, out: Path, capture: Capture, metadata: dict[str, Any]) -> None:
+    """Write the first frame of the fit in the folder `source` into the folder `out`, for a fit of
+    the same capture with other settings to resume; `metadata` is of that fit, see
+    `stream_metadata`.
+    """
+    files = FitFiles.of(source)
+    stream = StreamReader(files.stream)
+    rig = as_fitted(capture, stream)
+    out.mkdir(exist_ok=True)
+    with Recording(FitFiles.of(out), rig, metadata | about_lenses(rig)) as recording:
+        recording.extend([next(iter(stream))], read_reports(files.report, range(1)))
 
 
 def with_points(capture: Capture, seed: int, progress: Progress) -> Capture:

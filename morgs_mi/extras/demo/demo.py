@@ -20,6 +20,7 @@ from morgs_mi.core.files import REPORT, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report, Steps
 from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import ViewScores
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import stored_settings, synthesize
 from morgs_mi.fit.fit_config import FitConfig
@@ -27,11 +28,11 @@ from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
 from morgs_mi.playback.player import channel_image, render_stream
-from morgs_mi.playback.stream_header import about_lenses, as_fitted, truth_for_camera
+from morgs_mi.playback.stream_header import truth_for_camera
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
-from morgs_mi.runs.fit_capture import stream_capture
-from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_metadata
+from morgs_mi.runs.fit_capture import begin_as, stream_capture
+from morgs_mi.runs.fit_files import stream_metadata
 
 _COMPARED = (
     "psnr",
@@ -119,11 +120,8 @@ def run_demo(
         frames = [row.frame for row in results["full"].frames[1:count]]
         comparison: dict[str, Any] = {"frames": frames}
         for name, result in results.items():
-            scores = [asdict(frame.scores) for frame in result.frames[1:count]]
-            comparison[name] = {
-                score: float(np.mean([row[score] for row in scores])) if scores else None
-                for score in _COMPARED
-            }
+            mean = ViewScores.mean([frame.scores for frame in result.frames[1:count]])
+            comparison[name] = {score: getattr(mean, score) for score in _COMPARED}
         seconds["total"] = sum(seconds.values())
         report = {
             "config": asdict(config),
@@ -155,15 +153,9 @@ def _fit_plain(root: Path, config: DemoConfig, progress: Progress) -> None:
     switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
     plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
     # The first frame has no motion, so the settings of the motion change nothing.
-    source = root / "stream"
     out = root / "stream_plain"
-    stream = open_stream(source)
     metadata = stream_metadata(capture, next(capture.partial_frames()), plain)
-    fitted_capture = as_fitted(capture, stream)
-    metadata |= about_lenses(fitted_capture)
-    out.mkdir(exist_ok=True)
-    with Recording(FitFiles.of(out), fitted_capture, metadata) as recording:
-        recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
+    begin_as(root / "stream", out, capture, metadata)
     _fit(capture, out, plain, progress, resume=True)
 
 

@@ -30,7 +30,7 @@ from morgs_mi.codec.packets import decode
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.config import Count, apply_values, check_value
 from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import REPORT, locked_folder, write_json
+from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.plots import check_plot
 from morgs_mi.core.progress import Progress, Report
@@ -40,10 +40,9 @@ from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.results import ViewScores, known_mean
 from morgs_mi.extras.sweep.plot import draw_sweep
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
-from morgs_mi.playback.stream_header import as_fitted
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.runs.fit_capture import push_frame, stream_capture, with_points
-from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_metadata
+from morgs_mi.runs.fit_capture import begin_as, push_frame, stream_capture, with_points
+from morgs_mi.runs.fit_files import stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 
 PARTS = {
@@ -358,13 +357,7 @@ def _fit_later(
 ) -> list[float | None]:
     """Fit an arm, from the first frame in a folder if there is one; return its scores."""
     if first is not None:
-        stream = open_stream(first)
-        (packet,) = stream
-        (report,) = read_reports(first / REPORT, range(1))
-        folder.mkdir(exist_ok=True)
-        rig = as_fitted(capture, stream)
-        with Recording(FitFiles.of(folder), rig, stream.metadata | metadata) as recording:
-            recording.push(packet, report, None)
+        begin_as(first, folder, capture, metadata)
     stream_capture(capture, folder, config, first is not None, progress.report)
     result = evaluate_stream(folder, capture.path)
     progress(1, 1)
