@@ -37,15 +37,8 @@ def write_exr(path: str | Path, channels: Arrays) -> None:
     """Write `channels`, each [H, W], as one float32 EXR file, atomically.
 
     Raises:
-        ValueError: there is no channel, or the channels differ in shape.
         OSError: the file cannot be written.
     """
-    shapes = {name: np.shape(channel) for name, channel in channels.items()}
-    if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
-        raise ValueError(
-            f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
-            "for each."
-        )
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path, "write_exr()") as partial:

@@ -22,6 +22,12 @@ class _End:
     error: BaseException | None
 
 
+def close_items(items: object) -> None:
+    """End an iterator, if it is one that can be ended."""
+    if (close := getattr(items, "close", None)) is not None:
+        close()
+
+
 def prefetched(
     items: Iterable[T], ahead: int = 2, newest: bool = False, closed: Event | None = None
 ) -> Generator[T, None, None]:
@@ -55,8 +61,7 @@ def prefetched(
         except BaseException as raised:
             error = raised
         finally:
-            if (close := getattr(items, "close", None)) is not None:
-                close()
+            close_items(items)
         while newest and not ready.empty() and not closed.wait(0.01):
             pass  # the consumer may still take the last item
         put(_End(error))

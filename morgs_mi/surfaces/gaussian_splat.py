@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -20,7 +21,7 @@ from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.config import check_value
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
-from morgs_mi.core.types import Float, Tensor, Tensors, UInt32
+from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
@@ -41,7 +42,7 @@ _SETTINGS = (
 )
 
 
-class _SceneGaussians:
+class _SceneGaussians(SimpleNamespace):
     """The Gaussians of all shapes, in the scene's order (see `ActivatedGaussians`)."""
 
     means: Tensor
@@ -51,9 +52,6 @@ class _SceneGaussians:
     sh_coeffs: Tensor
     motion: Tensor = None
     confidence: Tensor = None
-
-    def __init__(self, tensors: Tensors) -> None:
-        vars(self).update(tensors)
 
     def rows(self, name: str, index: UInt32) -> list[Float]:
         """Return rows of an attribute, see `ActivatedGaussians`."""
@@ -73,7 +71,7 @@ def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
             part["sh_coeffs"] = dr.concat([part["sh_coeffs"], zeros], axis=1)
     if len(parts) > 1:
         parts = [{name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}]
-    return _SceneGaussians(parts[0])
+    return _SceneGaussians(**parts[0])
 
 
 def _property_problems(background: Any, aovs: list[str], surfaces: Any) -> Iterator[str]:
@@ -476,8 +474,6 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
                 self.warnings.add(key)
 
     def to_string(self) -> str:
-        settings = {name: getattr(self.config, name) for name in _SETTINGS}
-        settings = {"aovs": self.aovs, "background": self.background, **settings}
-        settings |= {"srgb_primitives": self.srgb_primitives, "surfaces": self.surfaces}
-        lines = ",\n".join(f"  {name} = {value}" for name, value in settings.items())
+        names = ("aovs", "background", "config", "srgb_primitives", "surfaces")
+        lines = ",\n".join(f"  {name} = {getattr(self, name)}" for name in names)
         return f"GaussianSplatIntegrator[\n{lines}\n]"

@@ -201,7 +201,7 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     dr.enable_grad([params[name] for name in names])
     shape = scene.shapes()[0]
     splats = gaussian_splat._SceneGaussians(
-        gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"])
+        **gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"])
     )
     camera = gaussian_splat._sensor_camera(scene.sensors()[0], border=0)
     plugin = gradients(mi.render(scene, params))

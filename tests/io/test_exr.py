@@ -23,11 +23,6 @@ def test_read_exr__inverts_write_exr_exactly_in_float32(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_write_exr__refuses_channels_of_other_shapes(tmp_path):
-    with pytest.raises(ValueError, match=r"must share one shape \[H, W\]"):
-        write_exr(tmp_path / "a.exr", {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))})
-
-
 def test_read_exr__distinguishes_missing_and_damaged_files(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected an EXR file, found none"):
         read_exr(tmp_path / "a.exr")

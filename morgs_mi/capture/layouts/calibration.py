@@ -99,9 +99,10 @@ class Calibration:
         views = self.test_views
         return replace(
             self,
-            cameras=tuple(self.cameras[index] for index in indices),
-            lenses=tuple(self.lenses[index] for index in indices),
-            clips=tuple(self.clips[index] for index in indices),
+            **{
+                name: tuple(getattr(self, name)[index] for index in indices)
+                for name in ("cameras", "lenses", "clips")
+            },
             test_views=views and tuple(indices.index(view) for view in views if view in indices),
             masks=tuple(self.masks[index] for index in indices if self.masks),
         )

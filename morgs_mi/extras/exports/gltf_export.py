@@ -21,7 +21,6 @@ import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +40,7 @@ _POINTS = 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None = None) -> None:
+def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray) -> None:
     """Write Gaussians as a self-contained .glb file; the file is written atomically.
 
     The extension has no attributes for motion and confidence, which are not written.
@@ -49,8 +48,7 @@ def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None =
     Args:
         path: the file.
         gaussians: N Gaussians in world axes.
-        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`; None if the world has y up
-            already.
+        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`.
 
     Raises:
         ValueError: there is no Gaussian, or there are more than fit into the 4 GiB of a .glb file.
@@ -61,7 +59,7 @@ def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None =
         partial.write_bytes(data)
 
 
-def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
+def glb(gaussians: Gaussians, axes: np.ndarray) -> bytes:
     """Return the bytes of the file that `write_gltf` writes.
 
     Raises:
@@ -70,12 +68,10 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     # An accessor must have at least one element.
     remedy = "glTF cannot hold an empty set"
     require(len(gaussians), "write_gltf()", "at least one Gaussian was expected", "none", remedy)
-    columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
+    columns = _attributes(rotated(gaussians, axes))
     binary = b"".join(column.tobytes() for column in columns.values())
-    node: dict[str, Any] = {"mesh": 0}
-    if axes is not None:
-        # Rotation back to the capture's axes: x_world = M x_gltf.
-        node["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
+    # Rotation back to the capture's axes: x_world = M x_gltf.
+    back = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
     accessors = [
         {
             "bufferView": i,
@@ -105,7 +101,7 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
         "extensionsUsed": [_NAME],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
+        "nodes": [{"mesh": 0, "extras": back}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [

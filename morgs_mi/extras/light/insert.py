@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -37,7 +37,7 @@ from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number, check_type, few, numbers, require
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
-from morgs_mi.core.config import Count, check_ranges
+from morgs_mi.core.config import Count, config_class
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
 from morgs_mi.core.memory import from_numpy
@@ -62,7 +62,7 @@ Build = Callable[[int, float], dict[str, Any]]
 _PLACE = "The inserted scene"  # where its errors begin
 
 
-@dataclass(frozen=True)
+@config_class
 class InsertConfig:
     """Rendering of an inserted scene."""
 
@@ -76,9 +76,6 @@ class InsertConfig:
     clipped: float | None = None
     """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a
     stream of an HDR recording, which is not clipped."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "render_inserted()")
 
 
 def load_insert(path: str | Path) -> Build:

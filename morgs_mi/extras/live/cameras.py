@@ -14,6 +14,7 @@ from threading import Condition, Event, Thread
 import numpy as np
 
 from morgs_mi.core.checks import require
+from morgs_mi.io.prefetch import close_items
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver
 # them in bursts.
@@ -44,12 +45,6 @@ class FrameSet:
     skew: float  #: Largest difference in time between two of the images, s.
     #: Number of images that each camera delivered after the frame set before and that are in none.
     dropped: int
-
-
-def close_images(images: object) -> None:
-    """End an iterator of images, if it is one that can be ended."""
-    if (close := getattr(images, "close", None)) is not None:
-        close()
 
 
 class CameraFeed:
@@ -236,7 +231,7 @@ class _Camera(Thread):
         except Exception as error:
             self.error = error
         finally:
-            close_images(self._images)
+            close_items(self._images)
             with self._change:
                 self.reason = str(self.error or self._end_text)
                 self._change.notify_all()

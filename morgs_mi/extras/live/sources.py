@@ -23,9 +23,9 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.core.checks import require
-from morgs_mi.extras.live.cameras import CameraFeed, close_images
+from morgs_mi.extras.live.cameras import CameraFeed
 from morgs_mi.extras.live.live_config import LiveConfig
-from morgs_mi.io.prefetch import prefetched
+from morgs_mi.io.prefetch import close_items, prefetched
 from morgs_mi.io.video import VideoReader
 
 Source = int | str | Path
@@ -159,7 +159,7 @@ def live_frames(
                 )
         finally:
             for stream in streams:
-                close_images(stream)
+                close_items(stream)
 
     return prefetched(frames(), newest=newest, closed=stop)
 

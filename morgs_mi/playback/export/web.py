@@ -30,6 +30,7 @@ from morgs_mi.core.files import STREAM, atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import seen_points
 from morgs_mi.playback.default_rig import DEFAULT_RIG
+from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import MOTION_SCALE, picture
 from morgs_mi.playback.stream_header import (
     metadata_entry,
@@ -135,6 +136,7 @@ def stream_html(stream: FrameSource) -> str:
     A stream that cannot be read becomes the sentence that describes why.
     """
     try:
+        frame_numbers(stream)  # refuses a stream without frames
         camera = stream.cameras[0]
         size = stream.path.stat().st_size
         aspect = camera.width / camera.height
@@ -145,9 +147,8 @@ def stream_html(stream: FrameSource) -> str:
             return _PLAYER.format(title=title, style=style, page=page)
         gaussians = next(gaussians for _, gaussians in play(stream))
         image = base64.b64encode(picture(stream, gaussians, camera)).decode()
-    except (OSError, ValueError, StopIteration) as error:
-        message = str(error) or f"{stream.path}: expected at least one frame, got none."
-        return f"<div>{html.escape(message)}</div>"
+    except (OSError, ValueError) as error:
+        return f"<div>{html.escape(str(error))}</div>"
     command = html.escape(f"morgs-mi export web {stream.path} page.html")
     text = f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with <code>{command}</code>."
     return _POSTER.format(title=title, style=style, image=image, text=text)
@@ -184,14 +185,13 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
     """Return the stream with the metadata that the page reads, after decoding it once; errors as
     `write_web_page`.
     """
+    frame_numbers(stream)  # refuses a stream without frames
     packets = list(stream)
     speeds = []
     for coded in coded_frames(packets):
         speeds.append(_speeds(coded.gaussians, stream.cameras))
         if progress is not None:
             progress(len(speeds))
-    if not speeds:
-        raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
     speeds, weights = np.hstack(speeds)
     scale = MOTION_SCALE
     if weights.any():

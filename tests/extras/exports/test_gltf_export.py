@@ -133,4 +133,4 @@ def test_gltf_axes__have_y_up_and_the_cameras_at_positive_z():
 
 def test_glb__rejects_an_empty_set():
     with pytest.raises(ValueError, match="at least one Gaussian was expected"):
-        glb(splats().select(np.zeros(0, int)))
+        glb(splats().select(np.zeros(0, int)), np.eye(3))
