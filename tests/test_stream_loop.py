@@ -236,7 +236,7 @@ def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
     loop = new_loop(with_fit(first_frame_steps=None, first_frame_seconds=1e-3))
     _, report = loop.push(clip[0][:4], lambda *tick: ticks.append(tick))
     stage, *count = ticks[-1]
-    assert report.steps == 100
+    assert 50 <= report.steps <= 100  # some are skipped to keep the time
     assert stage.startswith("First frame, about ")
     assert count == [100, 100]
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from morgs_mi.cli.main import main
 from morgs_mi.core import documentation
 from morgs_mi.core.config import config_toml
 from morgs_mi.core.documentation import documented, page, with_pages
@@ -67,21 +68,25 @@ def test_page__is_a_path_in_the_checkout_and_else_an_address(tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_page__gives_every_page_that_a_message_names(tmp_path, monkeypatch):
+def test_page__gives_every_page_that_a_message_names(tmp_path, monkeypatch, capsys):
     named = []
     for path in SOURCES:
         text = re.sub(r"\n\s*#[^\n]*", "", path.read_text(encoding="utf-8"))
-        if path.parent.name != "cli":  # where docstrings are help
-            text = re.sub(r'""".*?"""', "", text, flags=re.DOTALL)
+        text = re.sub(r'""".*?"""', "", text, flags=re.DOTALL)  # of options, see below
         named += re.findall(r"docs/[\w/-]+\.md", text)
     assert named == []
     monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
+    with pytest.raises(SystemExit):
+        main(["fit", "--help"])
+    text = capsys.readouterr().out
+    assert documentation.DOCUMENTATION in text
+    assert "docs/" not in text
     assert "docs/" not in config_toml(StreamConfig())
 
 
 @pytest.mark.slow
 def test_page__exists_for_every_call():
     text = "\n".join(path.read_text(encoding="utf-8") for path in SOURCES)
-    names = set(re.findall(r"\bpage\(['\"]([\w/]+)", text))
+    names = set(re.findall(r"(?:\bpage\(['\"]|docs/)([\w/-]+)(?:['\"]|\.md)", text))
     assert len(names) > 4
     assert [name for name in sorted(names) if not (ROOT / "docs" / f"{name}.md").is_file()] == []

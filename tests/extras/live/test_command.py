@@ -39,7 +39,7 @@ def test_Live__fits_videos_until_they_end(capture, tmp_path, videos, run, monkey
     assert status == 0
     assert re.fullmatch(
         rf"{out}/stream.morgs: fitted \d+ of \d+ frames \(\d+ dropped\) in [\d.]+ s, [\d.]+ MB, "
-        r"[\d.]+ s for .*\.\n",
+        rf"[\d.]+ s for .*\.\nNext: morgs-mi view {out}\n",
         printed,
     )
     assert "Frame 0: 0.0 s after the first, latency " in error
