@@ -42,8 +42,8 @@ SUM_ORDER_REL = 1e-5
 
 @pytest.fixture(autouse=True)
 def mitsuba_variant() -> Iterator[str]:
-    """Activate a variant before each test and again after it, and return its name:
-    ``llvm_ad_rgb``, or that of the environment variable ``MORGS_MI_TEST_VARIANT``.
+    """Activate a variant before each test and again after it, and return its name: the value of
+    the environment variable ``MORGS_MI_TEST_VARIANT``, by default ``llvm_ad_rgb``.
 
     Import it in ``conftest.py``.
     """

@@ -159,10 +159,10 @@ def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:
     except SystemExit:  # after the help, or a mistake before it
         width = shutil.get_terminal_size().columns
         command = next((COMMANDS[word] for word in args if word in COMMANDS), None)
-        groups: Mapping[str, Sequence[str]] = getattr(command, "groups", {})
+        groups = getattr(command, "groups", {})
         titles = {option: title for title, options in groups.items() for option in options}
-        blocks = {title: [f" {title}", f" {'-' * (width - 2)}"] for title in groups}
-        blocks = {"": [], **blocks}
+        rule = f" {'-' * (width - 2)}"
+        blocks = {"": []} | {title: [f" {title}", rule] for title in groups}
         title = ""
         # No value is no default.
         content = re.sub(r"\s+\(default:\s*(None|False)?\)", "", text.getvalue())

@@ -36,7 +36,7 @@ SETTINGS = {
 }
 
 Options = TypeVar("Options")
-# Classes whose help is that of their fields' docstrings.
+# Classes of options; `fill_help` reads the docstrings of their fields.
 _OPTIONS: list[Any] = []
 # A channel that commands render.
 ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]

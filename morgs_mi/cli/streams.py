@@ -49,8 +49,9 @@ def on_background(stream: FrameSource, color: str | None) -> None:
         return
     match = re.fullmatch("#" + 3 * "([0-9a-f]{2})", _COLORS.get(color, color.lower()))
     if match is None:
-        names = ", ".join(_COLORS)
-        raise ValueError(f"--background must be {names} or #rrggbb, got {color}.")
+        raise ValueError(
+            f"--background must be {', '.join(_COLORS)} or #rrggbb, got {color}; choose one."
+        )
     background = tuple(int(digits, 16) / 255 for digits in match.groups())
     render = asdict(replace(render_config(stream), background=background))
     config = stream.metadata.get("config", {})

@@ -232,8 +232,8 @@ def check_finite(groups: Arrays) -> None:
         bad = np.argwhere(~np.isfinite(value))
         if len(bad):
             raise ValueError(
-                f"the stream: `{name}` must be finite, that of Gaussian {bad[0][0]} is not; lower "
-                "the learning rates."
+                f"the stream: `{name}` must be finite, got NaN or infinity in Gaussian "
+                f"{bad[0][0]}; lower the learning rates."
             )
 
 

@@ -281,8 +281,11 @@ class Gaussians:
 
     @classmethod
     def from_parameters(cls, parameters: Tensors) -> Gaussians:
-        """Return Gaussians with `parameters`, such as those of an optimiser; other names are left
-        out. Gradients reach them.
+        """Return N Gaussians made of `parameters`, for instance of an optimiser, with gradients.
+
+        Args:
+            parameters: tensors [N, ...] by the names that `Gaussians.parameters` returns; entries
+                of other names are ignored.
 
         Raises:
             ValueError: one that all Gaussians have is missing, or as for `Gaussians`.

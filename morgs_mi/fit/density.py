@@ -225,7 +225,7 @@ class DensityControl:
     def step(self, optimizer: Adam, births: int) -> DensityPlan:
         """Prune what is faint, and clone or split the Gaussians with the largest scores.
 
-        Adam's moments are carried over; those of births are 0.
+        Survivors keep their moments of Adam; births have moments of 0.
 
         Args:
             optimizer: holds the Gaussians, whose number may change.

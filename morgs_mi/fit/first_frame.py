@@ -148,8 +148,8 @@ class _Pace:
                 if early:
                     late *= _LATE
                 left = max(self._begin + self._limit - moment, 1e-3)
-                most = self._steps / _LEAST_STEPS
-                self._stride = float(np.clip((early + late) * seconds / left, 1, max(most, 1)))
+                stride = min((early + late) * seconds / left, self._steps / _LEAST_STEPS)
+                self._stride = max(stride, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import numbers
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -49,11 +51,11 @@ def fit_gaussians(
     point_colors: np.ndarray | None = None,
     config: StreamConfig | None = None,
     masks: Sequence[np.ndarray | None] | None = None,
+    background: ArrayLike | None = None,
     progress: Report | None = None,
 ) -> Gaussians:
     """Return Gaussians fitted to images of one timestamp, as `StreamLoop` fits its first frame:
-    with its starts, balance of the cameras, density control and dropout. They equal
-    `loop.gaussians` after that frame.
+    with its starts, balance of the cameras, density control and dropout.
 
     Args:
         sensors: V views, `Camera`s or Mitsuba's `perspective` sensors.
@@ -63,8 +65,10 @@ def fit_gaussians(
         points: [P, 3] of the scene, world units; None, or fewer than 20: random ones inside the
             views.
         point_colors: [P, 3], encoded: 1 is white; None: grey.
-        config: settings; those of the first frame and the renderer count.
+        config: settings of the first frame and the renderer; None: the defaults.
         masks: per view [H, W] bool of valid pixels, or None.
+        background: colour [3] behind all Gaussians, encoded: 1 is white; or an image [V, H, W, 3],
+            as of `Camera`; None: that of the cameras and the config.
         progress: called with (stage, done, total).
 
     Example:
@@ -76,7 +80,17 @@ def fit_gaussians(
     """
     points = np.zeros((0, 3)) if points is None else points
     point_colors = np.full(np.shape(points), 0.5) if point_colors is None else point_colors
-    setup = prepare([Camera.of(sensor) for sensor in sensors], points, point_colors, config, masks)
+    cameras = [Camera.of(sensor) for sensor in sensors]
+    config = config or StreamConfig()
+    if background is not None:
+        behind = np.asarray(background)
+        if behind.ndim == 1:
+            render = replace(config.render, background=tuple(behind.tolist()))
+            config = replace(config, render=render)
+        else:
+            numbers("fit_gaussians()", "background", behind, len(cameras), *behind.shape[1:])
+            cameras = [replace(camera, background=behind[v]) for v, camera in enumerate(cameras)]
+    setup = prepare(cameras, points, point_colors, config, masks)
     observed = observe_frame(setup, 0, ImageHistory(), images)
     packet, _ = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
     return decode(None, packet).gaussians

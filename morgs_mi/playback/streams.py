@@ -93,7 +93,7 @@ def stream_path(out: str | Path) -> Path:
         raise FileNotFoundError(f"{path}: no such file or folder; check the path.")
     if path.is_dir() and not (path / STREAM).exists():
         fits = [path / file.name for file in listed(path) if (file / STREAM).is_file()]
-        if path / "stream" in fits or len(fits) == 1:  # of the demo, and of nobody else
+        if path / "stream" in fits or len(fits) == 1:  # the demo has two fits
             return stream_path(path / "stream" if path / "stream" in fits else fits[0])
         if (path / "meta.json").is_file():
             refuse_foreign(path / "meta.json")

@@ -157,7 +157,7 @@ class ViewGroup:
         images = backdrops([view.camera for view in self.views], self.config)
         if images is None:
             return self.config.background
-        return from_numpy(mi.Float, np.ascontiguousarray(self.crop(images)).ravel())
+        return from_numpy(mi.Float, self.crop(images).ravel())
 
     @with_render_lock
     def draw(self, gaussians: ActivatedGaussians) -> Drawing:

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, RenderConfig, StreamLoop, rasterize
+from morgs_mi import Camera, RenderConfig, StreamLoop, fit_gaussians, rasterize
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.render.active_view import ActiveView, ViewGroup
 from morgs_mi.render.region import Region
@@ -80,6 +80,33 @@ def test_camera__resizes_and_refuses_backgrounds():
         replace(CAMERA, background=np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="`background` must be finite"):
         replace(CAMERA, background=np.full((H, W, 3), np.nan))
+
+
+def test_fit_gaussians__equals_the_loop_over_a_colour_and_over_images():
+    ball = opaque_ball()
+    cameras = look_at_cameras(QUAD, 90)
+    config = quick(num_gaussians=80, first_frame_steps=8, density=NO_DENSITY)
+    cloud = ball.numpy()["means"], np.full((400, 3), 0.5)
+    behind = np.random.default_rng(0).uniform(0, 1, (4, cameras[0].height, cameras[0].width, 3))
+    over_images = [replace(c, background=b) for c, b in zip(cameras, behind, strict=True)]
+    over_white = replace(config, render=RenderConfig(background=(1.0, 1.0, 1.0)))
+    images = [
+        np.uint8(255 * np.clip(np.array(rasterize(ball, c).color), 0, 1) + 0.5) for c in over_images
+    ]
+    results = []
+    for background, views, settings in (
+        ((1.0, 1.0, 1.0), cameras, over_white),
+        (behind, over_images, config),
+    ):
+        loop = StreamLoop(views, *cloud, settings)
+        loop.push(images)
+        fitted = fit_gaussians(cameras, images, *cloud, config, background=background)
+        for name, value in fitted.numpy().items():
+            assert np.array_equal(value, loop.gaussians.numpy()[name]), name
+        results.append(fitted.numpy()["sh_coeffs"])
+    assert np.abs(results[0] - results[1]).max() > 0.01
+    with pytest.raises(ValueError, match=r"`background` must be .* \[4, 48, 64, 3\]"):
+        fit_gaussians(cameras, images, *cloud, config, background=behind[:2])
 
 
 def test_stream_loop__fits_what_stands_before_the_background():

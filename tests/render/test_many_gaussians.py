@@ -100,7 +100,7 @@ def test_rasterize__refuses_lists_that_exceed_32_bits():
     """2^12 x 2^12 pixels are 2^14 tiles, and entries are counted in 32 bits."""
     camera = Camera(np.array([[1e4, 0, 2048], [0, 1e4, 2048], [0, 0, 1]]), np.eye(4), 2**12, 2**12)
     values = stack(2**18 + 1, 0.5) | {"scales": np.full((2**18 + 1, 3), 1e3)}
-    # 4.29e9 with the blocks of a CPU, 8.59e9 with those of a GPU.
+    # Blocks on a GPU are half as large as on a CPU, and there are twice as many entries.
     with pytest.raises(
         ValueError, match=r"fewer than 2\^32 entries, got (4\.29|8\.59)e\+09 for 262145 Gaussians"
     ):

@@ -39,7 +39,6 @@ from morgs_mi.extras.calibration.checks.plots import write_rig
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.extras.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.playback.default_rig import DEFAULT_RIG
 
 # Columns of a camera, after its index and name.
 _COLUMNS = (
@@ -132,8 +131,8 @@ def _print_stream(path: Path) -> None:
     frames = quantity(len(stream.frame_numbers()), "frame")
     gaussians = next(stream.states()).gaussians
     memory = sum(value.nbytes for value in gaussians.numpy().values())
-    rig = "cameras around it" if DEFAULT_RIG in stream.metadata else "cameras"
-    print_result(f"{stream.path}: {frames} at {stream.fps:g} fps, {len(stream.cameras)} {rig}.")
+    cameras = quantity(len(stream.cameras), "camera")
+    print_result(f"{stream.path}: {frames} at {stream.fps:g} fps, {cameras}.")
     print_result(f"{gaussians}, {memory / 1e6:.1f} MB of memory.")
     print_next("view", path)
 
