@@ -200,8 +200,10 @@ class Settings:
         int | None, optional("INT", "(default: by Gaussians and time)")
     ] = None
     """Optimisation steps of the first frame."""
-    first_frame_seconds: Annotated[float | None, setting("first_frame_seconds")] = None
-    """Time of the first frame, which limits its Gaussians and steps."""
+    first_frame_seconds: float | None = None
+    """Time that the first frame may take on this machine; by default its Gaussians and steps take
+    120 s on two cores.
+    """
     sh_degree: Annotated[int | None, setting("sh_degree")] = None
     """Degree of the spherical harmonics, 0 to 3."""
     epochs: Annotated[int | None, setting("epochs")] = None

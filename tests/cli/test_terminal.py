@@ -50,7 +50,7 @@ def test_help__fits_the_terminal_without_orphan_lines(command, columns, monkeypa
         main([*command, "--help"])
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= columns
-    assert not re.search(r"\(default:\s*(None)?\)|\bSTR\b", "\n".join(lines))
+    assert not re.search(r"\(default:\s*(None)?\)|\b(STR|NONETYPE)\b", "\n".join(lines))
     for line, following in itertools.pairwise(lines):
         indent = len(following) - len(following.lstrip())
         # A line of the same paragraph begins with a word that did not fit.

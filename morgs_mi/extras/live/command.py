@@ -36,7 +36,7 @@ class LiveSettings(Settings):
     """Settings of a live fit, with its own defaults."""
 
     first_frame_seconds: Annotated[float | None, setting("first_frame_seconds", LIVE_STREAM)] = None
-    """Time of the first frame, which limits its Gaussians and steps."""
+    """Time that the first frame may take on this machine."""
     epochs: Annotated[int | None, setting("epochs", LIVE_STREAM)] = None
     """Passes over the views for every later frame."""
 
