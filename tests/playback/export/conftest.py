@@ -10,7 +10,7 @@ from tests.scenes.changing_splats import rig, splats, write_stream
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """Return the folder of a stream and its page, with SH of degree 3, births and a death, on a blue
+    """Return the folder of a stream and its page, with SH of degree 3, births, a death and a blue
     background, and its states.
     """
     folder = tmp_path_factory.mktemp("web")
