@@ -25,6 +25,12 @@ export function rendererOptions(metadata: Record<string, unknown>) {
   };
 }
 
+/** Colour behind the Gaussians; `metadata` is the stream's. */
+export function background(metadata: Record<string, unknown>): THREE.Color {
+  const { config } = metadata as { config?: { render?: { background?: [number, number, number] | null } } };
+  return new THREE.Color().setRGB(...(config?.render?.background ?? [0, 0, 0]), THREE.SRGBColorSpace);
+}
+
 export const TEXELS = /* glsl */ `
 vec4 texelOf(sampler2D rows, int i) {
   return texelFetch(rows, ivec2(i % ${WIDTH}, i / ${WIDTH}), 0);

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { focus, poseOf, turntableUp, upright } from "./cameras";
-import { rendererOptions, StreamMesh } from "./mesh";
+import { background, rendererOptions, StreamMesh } from "./mesh";
 import { Playback } from "./playback";
 import { type CameraFields, download } from "./stream";
 import type { Opened } from "./worker";
@@ -17,6 +17,8 @@ export class MorgsSplats {
   readonly fps: number;
   /** Options of a SparkRenderer with which the images are those of morgs-mi. */
   readonly rendererOptions: ReturnType<typeof rendererOptions>;
+  /** Colour behind the Gaussians in the fit, for the `background` of a scene. */
+  readonly background: THREE.Color;
   /** Description of the damage that ends the frames that play, if there is any. */
   damage: string | null;
   private wanted = 0;
@@ -26,6 +28,7 @@ export class MorgsSplats {
     ({ cameras: this.cameras, frames: this.frames, damage: this.damage } = stream);
     this.fps = playback.fps;
     this.rendererOptions = rendererOptions(stream.metadata);
+    this.background = background(stream.metadata);
     mesh.quaternion.copy(upright(this.cameras));
   }
 

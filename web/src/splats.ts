@@ -4,7 +4,7 @@ import { dyno, SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { FullScreenQuad } from "three/addons/postprocessing/Pass.js";
 import { CONFIDENCE_COLORS } from "./colors";
-import { rendererOptions, StreamMesh, TEXELS } from "./mesh";
+import { background, rendererOptions, StreamMesh, TEXELS } from "./mesh";
 import type { Update } from "./update";
 
 export type Mode = "color" | "motion" | "confidence";
@@ -59,11 +59,6 @@ void main() {
 
 const POST_VERTEX = "varying vec2 at; void main() { at = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }";
 
-/** Settings of the fit's renderer. */
-interface Metadata {
-  config?: { render?: { background?: [number, number, number] | null } };
-}
-
 export class Splats {
   readonly renderer: THREE.WebGLRenderer;
   readonly spark: SparkRenderer;
@@ -83,7 +78,7 @@ export class Splats {
   private readonly post: FullScreenQuad;
   private changed = true;
   /** Colour behind all Gaussians. */
-  private readonly background = new THREE.Color(0x000000);
+  private readonly background: THREE.Color;
   /** Stops by which the colours are brightened before they are clipped at white. */
   private stops = 0;
 
@@ -91,8 +86,7 @@ export class Splats {
     // Colours are display-referred, and blended as they are.
     THREE.ColorManagement.workingColorSpace = THREE.SRGBColorSpace;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, depth: false });
-    const behind = (metadata as Metadata).config?.render?.background;
-    if (behind) this.background.setRGB(...behind);
+    this.background = background(metadata);
     this.spark = new SparkRenderer({
       renderer: this.renderer,
       ...rendererOptions(metadata),

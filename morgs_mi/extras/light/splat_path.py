@@ -20,18 +20,21 @@ Mitsuba has a base class for every variant, so this module is imported again aft
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import reload
 from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 from annotated_types import Ge
-from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
+from mitsuba.ad.integrators import common  # pyright: ignore
 
 from morgs_mi.core.checks import require
 from morgs_mi.core.config import Count, check_value
 from morgs_mi.core.types import Bool, Float
 from morgs_mi.extras.light.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
+
+reload(common)  # else its classes are those of the variant before, until one of them is used
 
 _PROPERTIES = {
     "max_depth": Annotated[int, Ge(-1)],
@@ -55,7 +58,7 @@ class _Path:
     is_delta: Any  # whether the direction had no choice
 
 
-class SplatPathIntegrator(RBIntegrator):
+class SplatPathIntegrator(common.RBIntegrator):
     r"""Path tracer for surfaces among Gaussians (:monosp:`splat_path`), the `surfaces` of a
     `gaussian_splat`.
 
@@ -128,7 +131,9 @@ class SplatPathIntegrator(RBIntegrator):
 
             visible = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
             ds = mi.DirectionSample3f(scene, si, path.si)
-            mis = mis_weight(path.pdf, scene.pdf_emitter_direction(path.si, ds, ~path.is_delta))
+            mis = common.mis_weight(
+                path.pdf, scene.pdf_emitter_direction(path.si, ds, ~path.is_delta)
+            )
             with dr.resume_grad(when=not primal):
                 Le = β * mis * ds.emitter.eval(si, visible)
 
@@ -149,7 +154,7 @@ class SplatPathIntegrator(RBIntegrator):
                     attached = scene.eval_emitter_direction(si, ds, with_light)
                     weight = weight * dr.relative_grad(attached)
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, with_light)
-                Ld = β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
+                Ld = β * dr.select(ds.delta, 1, common.mis_weight(ds.pdf, pdf)) * value * weight
 
             # -------------------------- BSDF sampling ---------------------------
 
