@@ -26,7 +26,9 @@ header by reading it.
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import io
 import json
 import math
 import struct
@@ -39,13 +41,18 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO
 
+import cv2
+import imagesize
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, numbers
+from morgs_mi.core.color_space import byte_values
+from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Arrays
 
-_MAX_BYTES = 2**22
+_MAX_BYTES = 2**26  # most of them in strings
+_MAX_MARKS = 2**20  # commas and brackets
 _MAX_LEVELS = 32  # of JSON; recursive programs must be able to visit it
 _MAX_PIXELS = 2**26  # of a camera
 # Type of each entry, least and largest number or length, and the same in words.
@@ -71,7 +78,7 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
         ValueError: JSON cannot represent it, or a reader would refuse it.
     """
     fields = {
-        "cameras": [{key: getattr(camera, key) for key in _CAMERA} for camera in cameras],
+        "cameras": [_fields_of(camera) for camera in cameras],
         "fps": float(fps),
         "metadata": dict(metadata),
     }
@@ -83,6 +90,14 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"StreamWriter(): a reader would refuse the header: {error}.") from None
     return text
+
+
+def _fields_of(camera: Camera) -> dict[str, Any]:
+    fields = {key: getattr(camera, key) for key in _CAMERA}
+    if camera.background is not None:
+        image = png_bytes(byte_values(camera.background))
+        fields["background"] = base64.b64encode(image).decode()
+    return fields
 
 
 def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
@@ -111,6 +126,8 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
         if len(data) > most:
             raise ValueError(f"it must have at most {most} bytes, got {len(data)}")
         text = str(data, "utf-8")
+        if sum(map(text.count, ",[{")) > _MAX_MARKS:
+            raise ValueError(f"it must have at most {_MAX_MARKS} commas and opening brackets")
         value = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_number)
         if _levels(value) > _MAX_LEVELS:
             raise ValueError(f"it must be nested at most {_MAX_LEVELS} levels deep")
@@ -151,7 +168,22 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
             f"`viewmat` [4][4] of at most {LARGEST:g}, got {name!r:.60}, {width}x{height}, "
             f"{rows!s:.200}"
         )
-    return Camera(K, viewmat, width, height, name=name, near=near)
+    background = fields.get("background")
+    if background is not None:
+        background = _image_of(background, f"{where}.background", (width, height))
+    return Camera(K, viewmat, width, height, name=name, near=near, background=background)
+
+
+def _image_of(text: Any, where: str, size: tuple[int, int]) -> np.ndarray:
+    image = None
+    with contextlib.suppress(TypeError, ValueError):
+        data = base64.b64decode(text)
+        # Its own size first: a small file can claim any number of pixels.
+        if imagesize.get(io.BytesIO(data)) == size:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise ValueError(f"`{where}` must be a PNG image of {size[0]}x{size[1]} pixels in base64")
+    return image
 
 
 def _entries(

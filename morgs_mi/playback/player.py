@@ -17,7 +17,6 @@ from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Arrays
 from morgs_mi.playback.stream_header import metadata_entry, render_config, stream_exposure
 from morgs_mi.playback.visualise import (
@@ -151,9 +150,19 @@ def picture(
     gaussians: Gaussians,
     camera: Camera,
     channel: str = "color",
-    motion_scale: float | None = None,
-) -> bytes:
-    """Return the `channel_image` of Gaussians of a stream as PNG, with the colours of a display."""
-    values = render(gaussians, camera, (channel,), render_config(stream))[channel]
-    values = exposed(values, stream_exposure(stream)) if channel == "color" else values
-    return png_bytes(channel_image(channel, values, motion_scale))
+    motion_scale: float = np.nan,
+) -> np.ndarray:
+    """Return the `channel_image` of Gaussians of a stream, with the colours of a display; that of
+    motion lies over the grey image.
+    """
+    config = render_config(stream)
+    values = render(gaussians, camera, (channel,), config)[channel]
+    if channel == "color":
+        values = exposed(values, stream_exposure(stream))
+    image = channel_image(channel, values, motion_scale)
+    if channel == "motion":
+        still = 1 - np.minimum(np.linalg.norm(values, axis=2, keepdims=True) / motion_scale, 1)
+        color = np.array(rasterize(gaussians, camera, ("color",), (0, 0, 0), config=config).color)
+        grey = color.clip(0, 1) @ np.array([[0.299], [0.587], [0.114]])
+        image = to_uint8(image / 255 - still * (1 - grey))
+    return image

@@ -424,7 +424,7 @@ def _problems(
     if background is not None:
         shape = (*[V] * is_stack, *(region.shape(3) if region else (view.height, view.width, 3)))
         is_image = dr.is_tensor_v(background) and tuple(background.shape) == shape
-        values = background if is_image or not dr.is_array_v(background) else np.ravel(background)
+        values = background if is_image or not dr.is_array_v(background) else np.squeeze(background)
         # The pixels of a tensor are not read.
         if not is_image and not (
             np.shape(values) in ((3,), shape)

@@ -77,12 +77,21 @@ def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
 def _property_problems(background: Any, aovs: list[str], surfaces: Any) -> Iterator[str]:
     """Yield a sentence for each property of the plugin that is refused."""
     values = np.ravel(background)
+    is_image = np.ndim(background) > 1
     if background is not None and (
-        values.size not in (1, 3) or values.dtype.kind not in "fiu" or not bounded(values)
+        not (values.size in (1, 3) or is_image)
+        or values.dtype.kind not in "fiu"
+        or not bounded(values)
     ):
         yield (
-            f"`background` must be one or three finite numbers, got a {type(background).__name__}, "
-            f"{str(background)[:20]!r}; pass a colour such as {{'type': 'rgb', 'value': 1}}"
+            "`background` must be one or three finite numbers, or an image of them, got a "
+            f"{type(background).__name__}, {str(background)[:20]!r}; pass a colour such as "
+            "{'type': 'rgb', 'value': 1} or a mi.TensorXf [H, W, 3]"
+        )
+    if is_image and surfaces is not None:
+        yield (
+            "`background` must be a colour with `surfaces`, got an image; give the scene an "
+            "`envmap` emitter"
         )
     if surfaces is not None and (
         not isinstance(surfaces, mi.Integrator) or isinstance(surfaces, GaussianSplatIntegrator)
@@ -229,9 +238,11 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
          light after blending. (Default: True)
 
      * - background
-       - |rgb|, |exposed|, |differentiable|
-       - Colour behind all Gaussians, encoded like the primitives. Layers are composited in this
-         encoding, so encode the colours of an `rgba` film before compositing them. (Default: black)
+       - |rgb| or |tensor|, |exposed|, |differentiable|
+       - Colour behind all Gaussians, encoded like the primitives, or an image of such colours
+         [H, W, 3] of the whole film; [V, H, W, 3] for a `batch` of V sensors. Layers are composited
+         in this encoding, so encode the colours of an `rgba` film before compositing them.
+         (Default: black)
 
      * - aovs
        - |string|
@@ -291,8 +302,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         background = props.get("background", None)
         for problem in _property_problems(background, self.aovs, self.surfaces):
             raise ValueError(f"gaussian_splat: {problem}.")
-        self.background = None
-        if background is not None:
+        self.background = background
+        if np.size(background) in (1, 3) and background is not None:
             self.background = mi.Color3f(np.broadcast_to(np.ravel(background).astype(float), 3))
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None

@@ -1,15 +1,28 @@
 """The header: types and ranges of every entry are checked, by readers and by writers."""
 
+import base64
 import json
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.codec.container import StreamWriter, header_fields, header_json, load_json
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import byte_values
+from morgs_mi.core.png import png_bytes
 from tests.scenes.coded_clip import CAMERAS
 
 SOUND = json.loads(header_json(CAMERAS, 25, {"seed": 1}))
+
+
+SMALL = np.zeros((1, 2, 3), np.uint8)
+
+
+def encoded(image):
+    return base64.b64encode(png_bytes(image)).decode()
 
 
 def with_entry(path, text):
@@ -36,12 +49,13 @@ def with_entry(path, text):
         ("cameras.1", "7", r"`cameras\[1\].name` must be a string, got None"),
         ("cameras.0.K.0.0", "-1", "must be finite with positive focal lengths"),
         ("metadata", "[]", r"`metadata` must be an object, got \[\]"),
+        ("metadata.seed", f"[{'0,' * 2**20}0]", "at most 1048576 commas and opening brackets"),
         ("metadata.seed", "[" * 31 + "]" * 31, "nested at most 32 levels deep"),
         ("metadata.seed", "[" * 100_000 + "]" * 100_000, "the JSON is broken .*recursion"),
         (
             "metadata.seed",
-            f'"{"x" * 2**22}"',
-            "the JSON is broken .it must have at most 4194304 bytes",
+            f'"{"x" * 2**26}"',
+            "the JSON is broken .it must have at most 67108864 bytes",
         ),
     ],
     ids=lambda value: value[:20],
@@ -67,6 +81,9 @@ def test_header_fields__refuse_other_types_and_ranges(path, text, message):
             "` must have a printable `name`, at most 2^26 pixels, and `K` [3][3]",
         ),
         ("viewmat.2.1", "[1]", ": `matrix` must be an array of real numbers"),
+        ("background", "7", ".background` must be a PNG image of"),
+        ("background", '"aGFs"', ".background` must be a PNG image of"),
+        ("background", f'"{encoded(SMALL)}"', ".background` must be a PNG image of"),
     ],
 )
 def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path, text, message):
@@ -85,6 +102,16 @@ def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path, text, me
 def test_header_fields__refuse_other_json(data, message):
     with pytest.raises(ValueError, match=message):
         header_fields(data)
+
+
+def test_header__has_the_images_behind_the_gaussians():
+    camera = CAMERAS[0]
+    shape = (camera.height, camera.width, 3)
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    cameras = [replace(camera, background=image), camera]
+    views, _, _ = header_fields(header_json(cameras, 25, {}).encode())
+    assert_array_equal(byte_values(views[0].background), image)
+    assert views[1].background is None
 
 
 def test_load_json__accepts_what_is_within_its_limits():

@@ -103,6 +103,14 @@ def test_gaussian_splat__composites_over_the_background(raw):
     assert_close(image, to_linear(expected), atol=tol.IMAGE_ABS)
 
 
+def test_gaussian_splat__composites_over_an_image(raw):
+    camera = make_sensor_camera()
+    behind = np.random.default_rng(0).uniform(size=(camera.height, camera.width, 3))
+    image = plugin_image(raw, background=mi.TensorXf(behind))
+    expected = rasterize_view(raw, camera, behind)["color"]
+    assert_close(image, to_linear(expected), atol=tol.IMAGE_ABS)
+
+
 @pytest.mark.parametrize("sample_border", [False, True])
 def test_gaussian_splat__reconstruction_filter_weights_the_pixel_centres(raw, sample_border):
     crop = {"crop_offset_x": 4, "crop_offset_y": 5, "crop_width": 10, "crop_height": 8}

@@ -297,7 +297,7 @@ def test_gaussian_splat__refuses_films_other_than_rgb():
     [
         ({"aovs": "normal"}, "`aovs` must be out of motion, confidence, depth, got 'normal'"),
         ({"max_depth": 3}, "unreferenced property"),
-        ({"background": "white"}, "`background` must be one or three finite numbers, got a str"),
+        ({"background": "white"}, "`background` must be one or three finite .* got a str"),
         ({"background": {"type": "checkerboard"}}, "`background` must be .* got a Texture"),
         ({"srgb_primitives": "false"}, "`srgb_primitives` must be true or false, got 'false'"),
         ({"surfaces": {"type": "diffuse"}}, "`surfaces` must be an integrator of surfaces"),
@@ -339,6 +339,15 @@ for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
 """
     output = run_script(script, check=True).stdout
     assert [line for line in output.splitlines() if line.startswith(">")] == 4 * ["> True"]
+
+
+def test_gaussian_splat__refuses_an_image_with_surfaces_and_of_another_size(raw):
+    image = mi.TensorXf(np.zeros((3, 4, 3)))
+    with pytest.raises(RuntimeError, match="must be a colour with `surfaces`, got an image"):
+        mi.load_dict({"type": "gaussian_splat", "background": image, "surfaces": {"type": "path"}})
+    scene = make_mitsuba_scene(to_gaussians(raw), background=image)
+    with pytest.raises(ValueError, match=r"`background` must be three .* got float32 \[3, 4, 3\]"):
+        scene.integrator().render(scene)
 
 
 def test_ellipsoids__refuse_no_gaussians(raw):

@@ -4,7 +4,7 @@ import { positionOf } from "./cameras";
 import { CONFIDENCE_GRADIENT } from "./colors";
 import { Playback } from "./playback";
 import { Overlay, type Part, Server } from "./server";
-import { type Mode, MODES, Splats } from "./splats";
+import { GROUNDS, type Mode, MODES, Splats } from "./splats";
 import { type CameraFields, download } from "./stream";
 import { View } from "./view";
 import type { Opened } from "./worker";
@@ -19,6 +19,11 @@ const IDLE = 3000;
 const POLL = 1000;
 /** The view rests after so many milliseconds without a change. */
 const REST = 200;
+/** A note that answers to an action goes after so many milliseconds. */
+const NOTED = 3000;
+const NO_WEBGL =
+  "This page needs WebGL 2, which this browser does not offer: switch on hardware acceleration in its settings, or open " +
+  "the page in another browser or on another device.";
 /** Share of the page that shows the recording at first, percent. */
 const HALF = 50;
 
@@ -52,6 +57,7 @@ function note(topic: string, text: string): void {
 }
 
 async function begin(): Promise<void> {
+  if (document.createElement("canvas").getContext("webgl2") === null) return say(NO_WEBGL);
   const { address, server } = element("stream").dataset;
   const served = server === undefined ? null : new Server(address!);
   const player = new Player(served !== null, server === "recorded");
@@ -95,14 +101,20 @@ class Player {
   private view!: View;
   private cameras: CameraFields[] = [];
   private frames: number[] = [];
-  /** What the address asks for: #frame=12&camera=left&mode=motion&pause */
-  private readonly wishes = new URLSearchParams(location.hash.slice(1));
+  /** What the address asks for: #t=0.4&camera=left&mode=motion&pause */
+  private wishes = new URLSearchParams(location.hash.slice(1));
   private started = false;
   /** Motion that is fully saturated, as a fraction of the image's width per frame. */
   private motionScale = 0;
   /** Mode of the legend. */
   private legend: Mode = "color";
   private lastInput = 0;
+  /** Whether it was made by a pointer. */
+  private byPointer = false;
+  private ground = 0;
+  /** Nearest and farthest depth of the colours, page units. */
+  private depths = [1, 1];
+  private unit = 1;
   /** The stream, if it was opened. */
   private stream: Opened | null = null;
   /** Description of the end of a stream that may still grow. */
@@ -124,7 +136,7 @@ class Player {
    * @param served whether a server renders images, and adds to the stream
    * @param hasRecording whether it has recorded images
    */
-  constructor(private readonly served: boolean, hasRecording: boolean) {
+  constructor(private readonly served: boolean, private readonly hasRecording: boolean) {
     element("player").classList.toggle("served", served);
     element("wipe").hidden = !hasRecording;
     this.playback = new Playback({
@@ -217,13 +229,15 @@ class Player {
   /** Set up what depends on the cameras and the settings of the stream. */
   private setUp(stream: Opened): void {
     this.cameras = stream.cameras;
-    const unit = unitOf(this.cameras);
+    const unit = (this.unit = unitOf(this.cameras));
     const metadata = stream.metadata as Metadata;
     this.motionScale = metadata.motion_scale ?? 0.03;
     this.splats = new Splats(canvas, stream.metadata, unit);
     this.splats.expose(metadata.transfer?.display_exposure ?? 0);
-    this.view = new View(this.cameras, unit, canvas, () => this.followView());
-    if (metadata.default_rig === true) this.bound(); // no recorded views to stay near
+    const recorded = metadata.default_rig !== true;
+    this.view = new View(this.cameras, unit, canvas, recorded, recorded && !this.hasRecording, () => this.followView());
+    if (!recorded) this.bound(); // no recorded views to stay near
+    element("player").classList.toggle("recorded", recorded);
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
   }
 
@@ -232,12 +246,11 @@ class Player {
     this.started = true;
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
-    const wished = this.cameras.findIndex(({ name }) => name === this.wishes.get("camera"));
-    this.selectCamera(Math.max(0, wished));
-    if (this.wishes.has("follow")) this.playback.seek(this.playback.last);
-    else if (this.wishes.has("frame")) this.playback.seek(this.frames.indexOf(Number(this.wishes.get("frame"))));
-    else this.leaveFirst();
-    this.selectMode(MODES.find((mode) => mode === this.wishes.get("mode")) ?? "color");
+    this.selectCamera(0);
+    this.leaveFirst();
+    this.selectMode("color");
+    this.comply();
+    element("poster").hidden = true;
     this.listen();
     this.lastInput = performance.now();
     if (this.wishes.has("recorded")) this.wipe(Number(this.wishes.get("recorded")));
@@ -246,6 +259,73 @@ class Player {
     const paused = still || this.wishes.has("pause") || this.wishes.has("follow");
     this.playback.play(!paused && this.frames.length > 1);
     requestAnimationFrame((now) => this.tick(now));
+  }
+
+  /** Do what the address asks for. */
+  private comply(): void {
+    const { wishes, playback, frames } = this;
+    const number = (name: string) => Number(wishes.get(name));
+    const camera = this.cameras.findIndex(({ name }) => name === wishes.get("camera"));
+    if (camera >= 0) this.selectCamera(camera);
+    const place = wishes.get("view")?.split(",").map(Number) ?? [];
+    if (place.length === 6 && place.every(Number.isFinite)) {
+      if (this.view.bounded) this.bound();
+      this.view.look({ position: place.slice(0, 3), target: place.slice(3) });
+    }
+    if (wishes.has("follow")) playback.seek(playback.last);
+    else if (wishes.has("t")) playback.seek(Math.round(number("t") * playback.fps) || 0);
+    else if (wishes.has("frame")) playback.seek(frames.indexOf(number("frame")));
+    const mode = MODES.find((name) => name === wishes.get("mode"));
+    if (mode !== undefined) this.selectMode(mode);
+  }
+
+  /** Write what is shown into the address, and copy it. */
+  private async share(): Promise<void> {
+    const { view, playback, splats } = this;
+    const wishes = [`t=${(playback.position / playback.fps).toFixed(2)}`];
+    wishes.push(`camera=${encodeURIComponent(this.cameras[Number(cameraList.value)].name)}`);
+    if (splats.mode !== "color") wishes.push(`mode=${splats.mode}`);
+    const { position, target } = view.place;
+    const place = [...position, ...target];
+    const least = 1e-9 * Math.max(...place.map(Math.abs)); // of rounding errors
+    if (!view.atCamera) wishes.push(`view=${place.map((x) => (Math.abs(x) < least ? 0 : Number(x.toPrecision(6))))}`);
+    const address = `${location.href.split("#")[0]}#${wishes.join("&")}&pause`;
+    try {
+      history.replaceState(null, "", address);
+      await navigator.clipboard.writeText(address);
+      this.tell("The address of this view is copied.");
+    } catch {
+      this.tell("The address of this page has this view.");
+    }
+  }
+
+  private screenshot(): void {
+    this.splats.repaint(this.view.camera);
+    canvas.toBlob((image) => {
+      const link = document.createElement("a");
+      link.download = `${document.title} ${element("count").textContent!.split(" ")[0]}.png`;
+      link.href = URL.createObjectURL(image!);
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  }
+
+  /** Show a note for a while. */
+  private tell(text: string): void {
+    note("answer", text);
+    setTimeout(() => note("answer", ""), NOTED);
+  }
+
+  private nextGround(): void {
+    this.ground = (this.ground + 1) % GROUNDS.length;
+    this.splats.setGround(GROUNDS[this.ground]);
+    this.tell(`Background: ${GROUNDS[this.ground]}.`);
+  }
+
+  private focus({ clientX, clientY }: MouseEvent): void {
+    const { width, height } = canvas.getBoundingClientRect();
+    const point = this.splats.surface(this.view.camera, (2 * clientX) / width - 1, 1 - (2 * clientY) / height);
+    if (point !== null) this.view.orbit(point);
   }
 
   private tick(now: number): void {
@@ -261,6 +341,7 @@ class Player {
   private count(): void {
     const { position, last } = this.playback;
     element("count").textContent = `${this.frames[position]} / ${this.frames[last]}`;
+    element("clock").textContent = `${(position / this.playback.fps).toFixed(2)} s`;
     element("player").classList.toggle("first", position === 0);
   }
 
@@ -274,7 +355,8 @@ class Player {
     setFlag("split", "hidden", !splits);
     setFlag("share", "hidden", !splits);
     const rests = !playback.playing && !playback.busy && now - this.changed > REST;
-    this.exact.show(pressed("exact") && rests ? this.exactAddress(frame) : null);
+    const draws = this.splats.mode !== "depth";
+    this.exact.show(pressed("exact") && rests && draws ? this.exactAddress(frame) : null);
     setFlag("exact", "data-busy", !this.exact.settled);
   }
 
@@ -287,6 +369,17 @@ class Player {
   private followView(): void {
     this.changed = performance.now();
     this.splats.setView(this.view.camera, this.view.tangent(this.motionScale));
+    const { atCamera, rectangle } = this.view;
+    element("matte").hidden = !atCamera;
+    this.splats.showBackdrop(atCamera ? rectangle : null);
+  }
+
+  /** Lay the matte and the recorded image on the camera's image. */
+  private placeImages(): void {
+    const { x, y, width, height } = this.view.rectangle;
+    for (const [name, value] of Object.entries({ x, y, width, height })) {
+      element("matte").style.setProperty(`--${name}`, `${value}px`);
+    }
   }
 
   private resize(): void {
@@ -294,12 +387,22 @@ class Player {
     if (clientWidth === 0 || clientHeight === 0) return;
     this.splats.resize(clientWidth, clientHeight, Math.min(devicePixelRatio, 2));
     this.view.resize(clientWidth, clientHeight);
+    this.placeImages();
     this.splats.draw(this.view.camera);
   }
 
   private selectCamera(index: number): void {
     cameraList.value = String(index);
-    this.view.select(index, (camera) => this.splats.medianDepth(camera));
+    this.splats.loadBackdrop(this.cameras[index].background);
+    this.view.select(index, (camera) => this.splats.seen(camera));
+    this.placeImages();
+    this.scaleDepth();
+  }
+
+  private scaleDepth(): void {
+    if (this.splats.mode !== "depth") return;
+    this.depths = this.splats.scaleDepth(this.view.camera);
+    this.showLegend("depth");
   }
 
   private selectMode(mode: Mode): void {
@@ -307,7 +410,8 @@ class Player {
     this.splats.setMode(mode);
     this.followView();
     for (const button of modeButtons) button.ariaPressed = String(button.dataset.mode === mode);
-    if (mode !== "color") this.leaveFirst();
+    if (mode === "motion" || mode === "confidence") this.leaveFirst();
+    this.scaleDepth();
   }
 
   /** Go from the first frame, which has no motion and whose confidence is not learned, to the next. */
@@ -325,6 +429,9 @@ class Player {
     if (ramp) ramp.style.backgroundImage = `linear-gradient(to top, ${CONFIDENCE_GRADIENT})`;
     const scale = legend.querySelector(".scale");
     if (scale) scale.textContent = (100 * this.motionScale).toPrecision(2);
+    const [near, far] = this.depths.map((depth) => (depth / this.unit).toPrecision(3));
+    legend.querySelector(".near")?.replaceChildren(near);
+    legend.querySelector(".far")?.replaceChildren(far);
   }
 
   private selectSpeed(index: number): void {
@@ -384,6 +491,14 @@ class Player {
     const share = element<HTMLInputElement>("share");
     share.addEventListener("input", () => this.split(Number(share.value)));
     on("full", () => this.fullScreen());
+    on("ground", () => this.nextGround());
+    on("shot", () => this.screenshot());
+    on("send", () => void this.share());
+    canvas.addEventListener("dblclick", (event) => this.focus(event));
+    addEventListener("hashchange", () => {
+      this.wishes = new URLSearchParams(location.hash.slice(1));
+      this.comply();
+    });
     on("about", () => help.showModal());
     on("close", () => help.close());
     element("full").hidden = !document.fullscreenEnabled;
@@ -397,7 +512,17 @@ class Player {
       button.addEventListener("click", () => this.selectMode(button.dataset.mode as Mode));
     }
     for (const event of ["pointermove", "pointerdown", "keydown"]) {
-      addEventListener(event, () => (this.lastInput = performance.now()), { capture: true });
+      const listen = () => {
+        this.lastInput = performance.now();
+        this.byPointer = event !== "keydown";
+      };
+      addEventListener(event, listen, { capture: true });
+    }
+    // What was clicked must not take the keys.
+    for (const event of ["click", "change"]) {
+      element("bar").addEventListener(event, ({ target }) => {
+        if (this.byPointer && (event === "change" || target !== cameraList && target !== speedList)) canvas.focus();
+      });
     }
     addEventListener("keydown", (event) => this.key(event));
   }
@@ -427,6 +552,16 @@ class Player {
       "1": () => this.selectMode("color"),
       "2": () => this.selectMode("motion"),
       "3": () => this.selectMode("confidence"),
+      "4": () => this.selectMode("depth"),
+      w: () => this.view.walk(0, 0, 1),
+      s: () => this.view.walk(0, 0, -1),
+      a: () => this.view.walk(-1, 0, 0),
+      d: () => this.view.walk(1, 0, 0),
+      q: () => this.view.walk(0, -1, 0),
+      e: () => this.view.walk(0, 1, 0),
+      g: () => this.nextGround(),
+      p: () => this.screenshot(),
+      u: () => void this.share(),
       c: () => this.selectCamera((camera + 1) % this.cameras.length),
       r: () => this.selectCamera(camera),
       "<": () => this.selectSpeed(speedList.selectedIndex - 1),

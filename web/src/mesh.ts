@@ -2,13 +2,24 @@
 
 import { dyno, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import { COEFFICIENT, FREE, GEOMETRY, OPACITY, type Update } from "./update";
+import { COEFFICIENT, CONFIDENCE, FREE, GEOMETRY, OPACITY, type Update } from "./update";
 
 type SplatSource = NonNullable<SplatMesh["splats"]>;
 type FrameUpdate = Parameters<SplatMesh["update"]>[0];
 
 /** Texels of a line of the textures. */
 const WIDTH = 2048;
+
+/** Distance from a place of the image up to which a Gaussian is taken for what is there, half heights of the image. */
+const PICKED = 0.02;
+
+/** A Gaussian in an image: normalised coordinates, depth in world units, and whether it is more likely to move. */
+export interface Seen {
+  x: number;
+  y: number;
+  depth: number;
+  moves: boolean;
+}
 
 /** Options of a SparkRenderer that draws as the package's renderer does; `metadata` is the stream's. */
 export function rendererOptions(metadata: Record<string, unknown>) {
@@ -185,23 +196,48 @@ export class StreamMesh extends SplatMesh {
     else this.updateVersion();
   }
 
-  /** Median depth of the Gaussians in front of a camera, in world units. */
-  medianDepth(camera: THREE.PerspectiveCamera): number {
+  /** At most some thousand Gaussians that a camera sees. */
+  seen(camera: THREE.PerspectiveCamera): Seen[] {
     const { capacity, geometry } = this.textures;
     this.updateWorldMatrix(true, false);
     camera.updateMatrixWorld();
-    const toView = camera.matrixWorldInverse.clone().multiply(this.matrixWorld);
-    const depths: number[] = [];
+    const places: Seen[] = [];
     const point = new THREE.Vector3();
     const stride = GEOMETRY * Math.max(1, Math.floor(capacity / 5000));
     for (let at = 0; at < GEOMETRY * capacity; at += stride) {
       if (geometry[at + OPACITY] < -2) continue;
-      point.fromArray(geometry, at).applyMatrix4(toView);
+      point.fromArray(geometry, at).applyMatrix4(this.matrixWorld).applyMatrix4(camera.matrixWorldInverse);
       const depth = -point.z;
-      point.applyMatrix4(camera.projectionMatrix);
-      if (depth > 0 && Math.abs(point.x) < 1 && Math.abs(point.y) < 1) depths.push(depth);
+      const { x, y } = point.applyMatrix4(camera.projectionMatrix);
+      if (depth > 0 && Math.abs(x) < 1 && Math.abs(y) < 1) places.push({ x, y, depth, moves: geometry[at + CONFIDENCE] > 0 });
     }
+    return places;
+  }
+
+  /** Median depth of the Gaussians in front of a camera, in world units. */
+  medianDepth(camera: THREE.PerspectiveCamera): number {
+    const depths = this.seen(camera).map(({ depth }) => depth);
     return depths.sort((a, b) => a - b)[depths.length >> 1] ?? 1;
+  }
+
+  /** The first opaque surface at a place of the image, in normalised coordinates, or null. */
+  surface(camera: THREE.PerspectiveCamera, x: number, y: number): THREE.Vector3 | null {
+    const { capacity, geometry } = this.textures;
+    camera.updateMatrixWorld();
+    const toImage = camera.projectionMatrix.clone().multiply(camera.matrixWorldInverse).multiply(this.matrixWorld);
+    const projection = camera.projectionMatrix.elements;
+    const aspect = projection[5] / projection[0];
+    const point = new THREE.Vector3();
+    let nearest = Infinity;
+    let result: THREE.Vector3 | null = null;
+    for (let at = 0; at < GEOMETRY * capacity; at += GEOMETRY) {
+      if (geometry[at + OPACITY] < 0) continue;
+      const { x: px, y: py, z } = point.fromArray(geometry, at).applyMatrix4(toImage);
+      if (z < -1 || z > nearest || Math.hypot((px - x) * aspect, py - y) > PICKED) continue;
+      nearest = z;
+      result = new THREE.Vector3().fromArray(geometry, at).applyMatrix4(this.matrixWorld);
+    }
+    return result;
   }
 }
 

@@ -1,7 +1,7 @@
 /** From a state to the contents of the renderer's textures. */
 
 import { type Change, type State, step } from "./state";
-import { COEFFICIENT, DISPLACEMENT, FREE, GEOMETRY, OPACITY, type Update } from "./update";
+import { COEFFICIENT, CONFIDENCE, DISPLACEMENT, FREE, GEOMETRY, OPACITY, type Update } from "./update";
 
 /** Return the contents of all rows of a state, with the displacements of the change that led to it, if there is one. */
 export function everything(state: State, change: Change | null): Update {
@@ -79,7 +79,7 @@ function fillGeometry(state: State, rows: Uint32Array, geometry: Float32Array): 
   }
   if (!confidence) return;
   const [logits, ofLogits] = [values[values.length - 1], exponents[8]];
-  for (let k = 0; k < rows.length; k++) geometry[GEOMETRY * k + 11] = logits[rows[k]] * step(ofLogits[rows[k]]);
+  for (let k = 0; k < rows.length; k++) geometry[GEOMETRY * k + CONFIDENCE] = logits[rows[k]] * step(ofLogits[rows[k]]);
 }
 
 function fillCoefficients(state: State, rows: Uint32Array, K: number, sh: Uint16Array): void {

@@ -17,6 +17,8 @@ export interface CameraFields {
   width: number;
   height: number;
   near: number;
+  /** PNG image behind all Gaussians, base64. */
+  background?: string;
 }
 
 export interface PacketPlace {

@@ -8,6 +8,8 @@ export const GEOMETRY = 16;
 /** Place of the logit of the opacity, and its value in a free row. */
 export const OPACITY = 3;
 export const FREE = -1e9;
+/** Place of the logit of the confidence. */
+export const CONFIDENCE = 11;
 export const DISPLACEMENT = 12;
 /** Halves per SH coefficient: R, G, B and one unused. */
 export const COEFFICIENT = 4;

@@ -28,6 +28,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import STREAM, atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.png import jpeg_bytes
 from morgs_mi.core.rig import seen_points
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.clips import frame_numbers
@@ -52,6 +53,7 @@ _SAMPLES = 500
 _LEAST_SCALE = 0.001
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
 LARGEST = 4_000_000
+_POSTER_WIDTH = 640  # pixels of the image until the first frame is shown
 # Width and height of the player in pixels, unless the output of the cell is narrower.
 _WIDTH = 800
 _HEIGHT = 600
@@ -60,7 +62,7 @@ _PLAYER = (
     '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" '
     'srcdoc="{page}"></iframe>'
 )
-_POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
+_POSTER = '<img alt="{title}" style="{style}" src="{image}"><div>{text}</div>'
 
 
 def write_web_page(
@@ -95,7 +97,7 @@ def web_page(
 ) -> bytes:
     """Return the page that `write_web_page` writes; arguments and errors are the same."""
     data = _script("stream", published_bytes(stream, progress))
-    return _page(title or stream_name(stream), data, "data: blob:")
+    return _page(title or stream_name(stream), data, "data: blob:", first_image(stream))
 
 
 def write_web_folder(
@@ -121,7 +123,7 @@ def write_web_folder(
         OSError: the folder cannot be written.
     """
     data = published_bytes(stream, progress)
-    page = served_page(title or stream_name(stream))
+    page = served_page(title or stream_name(stream), image=first_image(stream))
     contents = {"index.html": page, STREAM: data, _MODULE: (_FOLDER / _MODULE).read_bytes()}
     with atomic_folder(path, "write_web_folder()") as partial:
         for name, content in contents.items():
@@ -145,8 +147,7 @@ def stream_html(stream: FrameSource) -> str:
         if size <= LARGEST:
             page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
             return _PLAYER.format(title=title, style=style, page=page)
-        gaussians = next(gaussians for _, gaussians in play(stream))
-        image = base64.b64encode(picture(stream, gaussians, camera)).decode()
+        image = first_image(stream)
     except (OSError, ValueError) as error:
         return f"<div>{html.escape(str(error))}</div>"
     command = html.escape(f"morgs-mi export web {stream.path} page.html")
@@ -154,17 +155,27 @@ def stream_html(stream: FrameSource) -> str:
     return _POSTER.format(title=title, style=style, image=image, text=text)
 
 
-def served_page(title: str, server: str | None = None) -> bytes:
+def first_image(stream: FrameSource) -> str:
+    """Return the first frame of a stream, from its first camera, as the address of a JPEG."""
+    gaussians = next(gaussians for _, gaussians in play(stream))
+    camera = stream.cameras[0]
+    camera = camera.with_width(min(_POSTER_WIDTH, camera.width))
+    image = base64.b64encode(jpeg_bytes(picture(stream, gaussians, camera))).decode()
+    return f"data:image/jpeg;base64,{image}"
+
+
+def served_page(title: str, server: str | None = None, image: str = "data:,") -> bytes:
     """Return the page for a server that has the stream as a file.
 
     Args:
         title: its title.
         server: for the server of `playback.viewer`: ``recorded`` if it has recorded images, or
             empty; None for any other.
+        image: address of an image until the first frame is shown.
     """
     attribute = "" if server is None else f' data-server="{server}"'
     place = f'<i id="stream" data-address="{STREAM}"{attribute} hidden></i>'
-    return _page(title, place, "'self' data: blob:")
+    return _page(title, place, "'self' data: blob:", image)
 
 
 def text_of_bytes(data: bytes) -> str:
@@ -238,13 +249,14 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     return np.hstack(views)
 
 
-def _page(title: str, data: str, connect: str) -> bytes:
+def _page(title: str, data: str, connect: str, image: str) -> bytes:
     code = gzip.compress((_FOLDER / "player.js").read_bytes(), 9, mtime=0)
     page = (_FOLDER / "player.html").read_text(encoding="utf-8")
     values = {
         "{version}": version("morgs-mi"),
         "{connect}": connect,
         "{title}": html.escape(title),
+        "{image}": image,
         "{notice}": (_FOLDER / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }

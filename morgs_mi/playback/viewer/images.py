@@ -17,6 +17,7 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, check_number
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.png import png_bytes
 from morgs_mi.playback.player import available_channels, picture
 from morgs_mi.playback.stream_header import (
     fitted_capture,
@@ -75,7 +76,7 @@ class ExactImages:
         gaussians = self._decoded[1]
         if channel not in available_channels(gaussians):
             raise ValueError(f"{stream.path}: expected a channel of the stream, got {channel!r}.")
-        return picture(stream, gaussians, camera, channel, motion_scale)
+        return png_bytes(picture(stream, gaussians, camera, channel, motion_scale))
 
 
 class RecordedImages:

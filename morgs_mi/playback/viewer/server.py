@@ -22,7 +22,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
-import cv2
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -34,6 +33,7 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import open_regular
 from morgs_mi.core.files import PROVISIONAL, STREAM
+from morgs_mi.core.png import jpeg_bytes
 from morgs_mi.playback.export.web import published_bytes, served_page
 from morgs_mi.playback.stream_header import stream_name
 from morgs_mi.playback.streams import SplatFile
@@ -157,9 +157,7 @@ class Viewer:
 
     def _send_recorded(self, request: Request) -> Response:
         image = self._recorded.at(StreamReader(self._newest(), follow=False), **request.path_params)
-        return Response(
-            cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg"
-        )
+        return Response(jpeg_bytes(image), media_type="image/jpeg")
 
     async def _send_exact(self, request: Request) -> Response:
         query = request.query_params

@@ -14,7 +14,7 @@ WIDTH = 480
 HEIGHT = 360
 # A software rasteriser on a busy machine starts slowly.
 TIMEOUT_MS = 60_000
-HIDDEN = "#bar, #legend, #message {visibility: hidden}"
+HIDDEN = "#bar, #legend, #message, #notes {visibility: hidden}"
 
 
 class Page:

@@ -40,7 +40,8 @@ def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a
     image = render(states[0].gaussians, stream.cameras[0], ("color",), render_config(stream))[
         "color"
     ]
-    assert_array_equal(decoded(base64.b64decode(source[1])), channel_image("color", image))
+    shown = decoded(base64.b64decode(source[1])).astype(int)
+    assert np.abs(shown - channel_image("color", image)).max() <= 24, "JPEG"
 
 
 @pytest.mark.parametrize("largest", [0, 10**9])

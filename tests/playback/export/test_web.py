@@ -2,17 +2,19 @@
 streams.
 """
 
+import base64
 import itertools
 import os
 import re
 from dataclasses import replace
 from importlib.resources import files
 
+import cv2
 import numpy as np
 import pytest
 
 from morgs_mi.cli.main import main
-from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.container import StreamWriter, camera_of_fields
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import (
     coded_frames,
@@ -22,6 +24,7 @@ from morgs_mi.codec.packets import (
     residual_packet,
 )
 from morgs_mi.core.color_space import TRANSFER, exposed
+from morgs_mi.core.rig import seen_points
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.export.web import (
@@ -30,7 +33,7 @@ from morgs_mi.playback.export.web import (
     write_web_folder,
     write_web_page,
 )
-from morgs_mi.playback.player import channel_image, render
+from morgs_mi.playback.player import channel_image, picture, render
 from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
 from tests.playback.export.pages import HEIGHT, WIDTH, Page, served
@@ -180,6 +183,7 @@ def page(opened):
     and requested.
     """
     opened.page.evaluate("player.playback.play(false); player.playback.loop = true")
+    opened.page.evaluate("if (!player.view.bounded) player.bound()")
     opened.page.evaluate(
         "player.selectMode('color'); player.selectCamera(0); player.selectSpeed(3)"
     )
@@ -239,11 +243,9 @@ def test_page__shows_the_images_of_the_renderer(page, clip, mode, least):
     for camera, frame in ((0, 0), (0, 3), (2, 2), (2, 1)):
         page.page.locator("#camera").select_option(str(camera))
         page.show(frame)
-        image = render(
-            states[frame].gaussians, stream.cameras[camera], (mode,), render_config(stream)
-        )[mode]
         scale = WIDTH * page.page.evaluate("player.motionScale")
-        assert psnr(page.image() / 255, channel_image(mode, image, scale) / 255) > least
+        image = picture(stream, states[frame].gaussians, stream.cameras[camera], mode, scale)
+        assert psnr(page.image() / 255, image / 255) > least
 
 
 def test_page__plays_to_the_end_and_scrubs_back(page, clip):
@@ -361,24 +363,27 @@ def test_page__draws_orbits_back_to_the_cameras_unless_it_is_switched_off(page):
     assert drag(page, 0) == pytest.approx(8, abs=0.2)
 
 
-def test_page__shows_a_file_of_gaussians_and_orbits_freely(browser, tmp_path):
+def test_page__fills_the_window_with_a_file_and_orbits_freely(browser, tmp_path):
     write_ply(tmp_path / "scene.ply", splats(degree=3))
     stream = open_stream(tmp_path / "scene.ply")
     write_web_page(stream, tmp_path / "page.html")
     (state,) = coded_frames(stream)
-    camera = stream.cameras[0].with_width(WIDTH)  # the page shows more of the scene above and below
-    K = camera.K.copy()
-    K[1, 2] = HEIGHT / 2
-    camera = replace(camera, K=K, height=HEIGHT)
     with Player(browser, (tmp_path / "page.html").as_uri()) as opened:
-        image = render(state.gaussians, camera, ("color",), render_config(stream))["color"]
-        assert psnr(opened.image() / 255, channel_image("color", image) / 255) > 40
+        fields = opened.page.evaluate(f"player.view.fields({WIDTH}, {HEIGHT})")
+        image = picture(stream, state.gaussians, camera_of_fields(fields, "page"))
+        assert psnr(opened.image() / 255, image / 255) > 40
+        _, pixels, _ = seen_points(stream.cameras[0], np.asarray(state.gaussians.means))
+        _, shown, _ = seen_points(
+            camera_of_fields(fields, "page"), np.asarray(state.gaussians.means)
+        )
+        assert (np.ptp(shown, axis=0) / (WIDTH, HEIGHT)).max() > 0.9
+        assert np.ptp(shown, axis=0).max() > np.ptp(pixels, axis=0).max() * WIDTH / 1280
         assert opened.page.evaluate("player.view.bounded") is False
-        shown = [
+        visible = [
             opened.page.locator(f"#{name}").is_visible()
             for name in ("slider", "speed", "loop", "camera", "full")
         ]
-        assert shown == [False, False, False, True, True]
+        assert visible == [False, False, False, True, True]
         assert opened.errors == []
 
 
@@ -440,6 +445,105 @@ def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
                 box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 32
             )
         assert not page.errors
+
+
+def test_page__covers_an_upright_phone_around_what_moves(browser, clip):
+    upright = {"viewport": {"width": 240, "height": 480}}
+    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause", **upright) as page:
+        assert page.page.evaluate("player.view.frame.height") == HEIGHT
+        place = page.page.evaluate("player.view.rectangle")
+        assert place["y"] == 0
+        assert place["height"] == 480
+        gaussians = clip[1][0].gaussians
+        _, pixels, _ = seen_points(open_stream(clip[0]).cameras[0], np.asarray(gaussians.means))
+        moving = pixels[np.asarray(gaussians.logit_confidence) > 0, 0]
+        frame = page.page.evaluate("player.view.frame")
+        assert abs(np.median(moving) - frame["x"] - frame["width"] / 2) < 12
+        assert not page.errors
+
+
+def test_page__follows_the_address_and_shares_it(page):
+    goto = "location.hash = '{}'"
+    page.page.evaluate(goto.format("t=0.2&camera=right&mode=depth"))
+    page.wait("player.playback.position === 2 && player.settled")
+    assert page.page.locator("#camera").input_value() == "2"
+    assert "Depth" in page.text("#legend")
+    page.page.evaluate(goto.format("view=0,-3,1,0,0,0.2&mode=color"))
+    page.wait(AT_REST)
+    image = page.image()
+    page.page.keyboard.press("u")
+    page.page.get_by_text("The address of this view is copied.").wait_for()
+    shared = page.page.url
+    assert "t=0.20&camera=right&view=0,-3,1,0,0,0.2&pause" in shared
+    page.page.keyboard.press("r")
+    page.page.evaluate(goto.format(shared.partition("#")[2] + "&again"))
+    page.wait(AT_REST)
+    assert psnr(page.image() / 255, image / 255) > 50
+    page.page.evaluate(
+        "history.replaceState(null, '', location.href.split('#')[0]); player.bound()"
+    )
+
+
+def test_page__moves_by_keys_whatever_was_clicked(page):
+    page.page.keyboard.press("b")
+    page.page.get_by_text("Depth", exact=True).click()
+    page.wait("player.settled")
+    at = "player.view.place.position"
+    start = np.array(page.page.evaluate(at))
+    for key, is_moved in (("w", True), ("s", False), ("d", True), ("a", False)):
+        page.page.keyboard.press(key)
+        change = np.array(page.page.evaluate(at)) - start
+        assert (np.linalg.norm(change) > 0.1) == is_moved
+    page.page.keyboard.press(" ")  # not the button that was clicked
+    page.wait("player.playback.playing")
+    page.page.keyboard.press("b")
+
+
+def test_page__orbits_around_what_is_double_clicked(page, clip):
+    page.page.keyboard.press("b")
+    camera = open_stream(clip[0]).cameras[0]
+    gaussians = clip[1][0].gaussians
+    opaque = np.asarray(gaussians.means)[np.asarray(gaussians.opacities) > 0.5]
+    _, pixels, depths = seen_points(camera, opaque)
+    nearest = int(np.argmin(np.where(pixels[:, 1] < 140, depths, np.inf)))  # above the controls
+    page.page.mouse.dblclick(*pixels[nearest].tolist())
+    target = page.page.evaluate("player.view.place.target")
+    expected = opaque[nearest]
+    assert np.linalg.norm(target - expected) < 0.1
+    page.page.keyboard.press("b")
+
+
+def test_page__shows_other_backgrounds(page):
+    corners = []
+    for _ in range(5):
+        corners.append(page.image()[:2, :2].mean(axis=(0, 1)))
+        page.page.get_by_label("Background").click()
+        page.wait("player.settled")
+    expected = ([51, 128, 204], [0, 0, 0], [128, 128, 128], [255, 255, 255])
+    assert np.allclose(corners[:4], expected, atol=2)
+    assert 100 < corners[4].mean() < 155
+
+
+def test_page__saves_a_screenshot(page):
+    with page.page.expect_download() as download:
+        page.page.get_by_label("Screenshot").click()
+    image = cv2.imread(str(download.value.path()), cv2.IMREAD_COLOR_RGB)
+    assert psnr(image / 255, page.image() / 255) > 50
+
+
+def test_page__shows_its_first_frame_without_webgl(browser, clip):
+    script = "HTMLCanvasElement.prototype.getContext = () => null"
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    context.add_init_script(script)
+    page = context.new_page()
+    page.goto((clip[0] / "page.html").as_uri())
+    page.get_by_text("This page needs WebGL 2, which this browser does not offer").wait_for()
+    data = base64.b64decode(page.locator("#poster").get_attribute("src").partition(",")[2])
+    poster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    stream = open_stream(clip[0])
+    expected = picture(stream, clip[1][0].gaussians, stream.cameras[0])
+    assert psnr(poster / 255, expected / 255) > 30
+    context.close()
 
 
 @pytest.fixture

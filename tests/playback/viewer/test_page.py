@@ -10,9 +10,8 @@ import pytest
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.playback.player import channel_image
+from morgs_mi.playback.player import picture
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.render.rasterize import rasterize
 from tests.playback.export.pages import HEIGHT, WIDTH, Page
 from tests.playback.viewer.serving import decoded, viewing
 from tests.scenes.cameras import look_at_cameras
@@ -167,8 +166,7 @@ def test_page__shows_the_image_of_rasterize_when_the_view_rests(browser, clip, u
         page.press("x", RENDERING)
         for key, mode in ((1, "color"), (2, "motion"), (3, "confidence")):
             page.press(str(key), RENDERING)
-            image = np.array(rasterize(gaussians, camera, (mode,))[mode])
-            expected = channel_image(mode, image, 0.03 * WIDTH)
+            expected = picture(open_stream(clip[0]), gaussians, camera, mode, 0.03 * WIDTH)
             assert np.abs(page.exact_image() - expected.astype(int)).max() <= 3, (
                 "the page rounds the camera"
             )
