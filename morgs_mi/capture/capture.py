@@ -122,7 +122,7 @@ class Capture:
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_points(str(self.path), self.points, self.point_colors)
+        check_points(self.path, self.points, self.point_colors)
 
     def __repr__(self) -> str:
         held_out = ", ".join(self.names[view] for view in self.test_views) or "none"

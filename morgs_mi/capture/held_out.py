@@ -71,4 +71,4 @@ def _indices(place: Path, views: TestViews, names: Sequence[str]) -> tuple[int, 
     if views is None:
         return ()
     some = views if isinstance(views, list | tuple) else [views]
-    return tuple(sorted({view_index(str(place), "`test_view`", view, names) for view in some}))
+    return tuple(sorted({view_index(place, "`test_view`", view, names) for view in some}))

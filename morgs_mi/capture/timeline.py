@@ -414,8 +414,8 @@ def read_settings(path: Path) -> dict[str, Any]:
         warn_unread(path, settings.keys() - _SETTINGS)
     for name, interval in _INTERVALS.items():
         if (value := settings.get(name)) is not None:
-            check_number(str(path), name, value, interval)
+            check_number(path, name, value, interval)
     readout = settings.get("readout", 0.0)
     for value in readout.values() if isinstance(readout, dict) else [readout]:
-        check_number(str(path), "readout", value, "[-1, 1]")
+        check_number(path, "readout", value, "[-1, 1]")
     return settings

@@ -252,7 +252,7 @@ class Settings:
         if self.preset is not None:
             config = apply_preset(config, self.preset)
         if self.config is not None:
-            config = apply_values(config, read_config(self.config), str(self.config))
+            config = apply_values(config, read_config(self.config), self.config)
         for key, value in self.given().items():
             tables = reduce(lambda inner, name: {name: inner}, reversed(key.split(".")), value)
             config = apply_values(config, tables)
@@ -279,7 +279,7 @@ class Settings:
             if self.config is None or not names:
                 raise
             fields = [name.removeprefix("motion.") for name in names]
-            raise relocated(error, str(self.config), "motion.", fields) from None
+            raise relocated(error, self.config, "motion.", fields) from None
 
 
 # As fields of a command: options without a prefix. None means "not given", so it cannot be passed.

@@ -65,7 +65,7 @@ def check_claim(path: str | Path, claimed: int, content: str) -> None:
     size = Path(path).stat().st_size
     require(
         claimed <= _FACTOR * size + _ALLOWANCE,
-        str(path),
+        path,
         f"expected content that fits its {size} bytes",
         f"a claim of {content}, which takes {claimed / 1e6:.0f} MB",
         "the file is broken, create it again",
@@ -80,7 +80,7 @@ def regular(path: str | Path) -> Path:
     """
     path = Path(path)
     is_other = path.exists() and not path.is_file()
-    require(not is_other, str(path), "expected a file", "a folder, a pipe or a device", "remove it")
+    require(not is_other, path, "expected a file", "a folder, a pipe or a device", "remove it")
     return path
 
 
@@ -101,7 +101,7 @@ def open_regular(path: str | Path, follow: bool = True) -> BinaryIO:
     if not follow:
         # Windows has no such flag.
         is_link = os.path.islink(path)
-        require(not is_link, str(path), "expected a file", "a link", "open the file that it names")
+        require(not is_link, path, "expected a file", "a link", "open the file that it names")
         extra |= getattr(os, "O_NOFOLLOW", 0)
     file = open(  # noqa: SIM115 (the caller closes it)
         path, "rb", opener=lambda name, flags: os.open(name, flags | extra)
@@ -121,7 +121,7 @@ def read_bytes(path: str | Path, most: float = math.inf) -> bytes:
     """
     size = regular(path).stat().st_size
     remedy = "leave out what is not needed"
-    require(size <= most, str(path), f"expected at most {most} bytes", size, remedy)
+    require(size <= most, path, f"expected at most {most} bytes", size, remedy)
     return Path(path).read_bytes()
 
 

@@ -16,7 +16,7 @@ LARGEST = 1e12
 
 
 @contextmanager
-def errors_at(place: str) -> Iterator[None]:
+def errors_at(place: object) -> Iterator[None]:
     """Prefix the errors of values with their place, such as a file and a row.
 
     Raises:
@@ -33,12 +33,12 @@ def bounded(values: ArrayLike) -> bool:
     return bool((np.abs(values) <= LARGEST).all())
 
 
-def require(holds: Any, place: str, requirement: str, value: Any, remedy: str) -> None:
+def require(holds: Any, place: object, requirement: str, value: Any, remedy: str) -> None:
     """Raise an error unless a condition holds.
 
     Args:
         holds: whether it does.
-        place: where the error's sentence begins, such as a function.
+        place: where the error's sentence begins, such as a function or a file.
         requirement: what must be, in words.
         value: what is instead.
         remedy: end of the sentence.
@@ -50,7 +50,7 @@ def require(holds: Any, place: str, requirement: str, value: Any, remedy: str) -
         raise ValueError(f"{place}: {requirement}, got {value}; {remedy}.")
 
 
-def check_number(place: str, name: str, value: Any, interval: str) -> None:
+def check_number(place: object, name: str, value: Any, interval: str) -> None:
     """Raise an error unless a setting is a number in an interval.
 
     Args:
@@ -125,7 +125,7 @@ def valid_pixels(mask: np.ndarray | None, shape: Sequence[int]) -> np.ndarray:
     return np.ones(shape[:2], bool) if mask is None else mask
 
 
-def view_index(place: str, setting: str, view: Any, names: Sequence[str]) -> int:
+def view_index(place: object, setting: str, view: Any, names: Sequence[str]) -> int:
     """Return the index of a view that a setting gives by its name, or by its index.
 
     Raises:
@@ -155,7 +155,7 @@ def kind_of(value: Any) -> str:
     )
 
 
-def numbers(place: str, name: str, values: ArrayLike, *shape: int) -> np.ndarray:
+def numbers(place: object, name: str, values: ArrayLike, *shape: int) -> np.ndarray:
     """Return an argument as a NumPy array, which is not a copy where it is one already.
 
     Raises:
@@ -177,7 +177,7 @@ def numbers(place: str, name: str, values: ArrayLike, *shape: int) -> np.ndarray
 
 
 def check_points(
-    place: str, points: ArrayLike, colors: ArrayLike, most: float = 1.0
+    place: object, points: ArrayLike, colors: ArrayLike, most: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points and colours as arrays [P, 3], P >= 0, if they are finite and the colours lie in
     [0, most].

@@ -156,7 +156,7 @@ def _expected(value: Any, kind: Any) -> str:
 
 
 def apply_values(
-    config: Config, values: Mapping[str, Any], source: str = "apply_values()", prefix: str = ""
+    config: Config, values: Mapping[str, Any], source: object = "apply_values()", prefix: str = ""
 ) -> Config:
     """Return a config with some of its settings replaced.
 
@@ -237,7 +237,7 @@ def _table(config: Any, prefix: str) -> Iterator[str]:
         yield from (*comment, f"{name} = {text}".replace("\x7f", "\\u007f"))
 
 
-def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> ValueError:
+def relocated(error: ValueError, source: object, prefix: str, names: list[str]) -> ValueError:
     """Return an error of a config's check with `source` as the place and full keys in place of
     field names.
 

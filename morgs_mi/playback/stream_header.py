@@ -54,7 +54,7 @@ def find_camera(stream: FrameSource, camera: int | str) -> Camera:
         ValueError: the rig has no such camera.
     """
     names = [view.name for view in stream.cameras]
-    return stream.cameras[view_index(str(stream.path), "the camera", camera, names)]
+    return stream.cameras[view_index(stream.path, "the camera", camera, names)]
 
 
 def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTruth | None:

@@ -61,7 +61,7 @@ class SplatFile(FrameSource):
         self.path = path
         self.fps = 30.0
         self.metadata = {"num_frames": 1, DEFAULT_RIG: not trained}
-        with errors_at(str(path)):
+        with errors_at(path):
             self.cameras = trained or default_rig([gaussians])
         motion = np.zeros((len(gaussians), 3), np.float32)
         ids = np.arange(len(gaussians), dtype=np.uint32)

@@ -194,7 +194,7 @@ def _read_calibration(path: Path) -> Calibration:
     source = path / "transforms.json"
     meta = read_json(source)
     meta = meta if isinstance(meta, dict) else {}
-    with errors_at(str(source)):
+    with errors_at(source):
         frames = _value(meta, "frames")
         points_file = _beside(source, _value(meta, "ply_file_path"))
         splits = {split: names for split in _SPLITS if (names := _value(meta, split)) is not None}

@@ -209,7 +209,7 @@ def calibrate(
         )
         require(
             config.partial or not result.left_out,
-            str(path),
+            path,
             f"expected to register all {len(result.checks)} cameras",
             f"{len(result.cameras)}, without {', '.join(result.left_out)}",
             f"move these so that neighbours see the same objects, {_MORE_TEXTURE}, calibrate on "
@@ -302,7 +302,7 @@ def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tupl
     names = names_without(path, clips, without)
     requirement = "expected names without line feeds, as COLMAP has one image a line"
     broken = [name for name in names if "\n" in name]
-    require(not broken, str(path), requirement, repr(few(broken)), "rename it")
+    require(not broken, path, requirement, repr(few(broken)), "rename it")
     if len(names) < 2:
         raise ValueError(
             f"{path}: expected the clips of at least two cameras, found "

@@ -110,7 +110,7 @@ def estimate_time_offsets(
         ValueError: the recording has one camera or fewer than four frames, an image is missing, or
             nothing moves.
     """
-    place = str(capture.path)
+    place = capture.path
     cameras = len(capture.cameras)
     require(cameras > 1, place, "expected at least 2 cameras to compare clocks", 1, "record more")
     clips = _Clips.of(capture, progress)
@@ -228,9 +228,14 @@ class _Clips:
                 # There are fewer fits if a round is left out.
                 self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * _TIMESTAMPS)
         equations = reduce(add, parts)
-        place = str(self.capture.path)
         requirement = f"expected motion in the first {self.num_frames} frames"
-        require(equations.own.any(), place, requirement, "none", "record something that moves")
+        require(
+            equations.own.any(),
+            self.capture.path,
+            requirement,
+            "none",
+            "record something that moves",
+        )
         return equations
 
     def _equations_at(self, times: np.ndarray, blur: float) -> OffsetEquations:

@@ -98,7 +98,7 @@ def import_frames(
         )
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     frames_in_view = [read_splats(paths[t], most_invalid) for t in in_view]
-    with errors_at(str(paths[0].parent)):
+    with errors_at(paths[0].parent):
         cameras = default_rig(frames_in_view, axes)
     del frames_in_view
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -156,7 +156,7 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         ValueError: there are no such files, or they have several formats.
     """
     paths = [Path(source) for source in sources]
-    place = str(paths[0]) if paths else "import_frames()"
+    place = paths[0] if paths else "import_frames()"
     if missing := [path for path in paths if not path.exists()]:
         raise FileNotFoundError(
             f"{missing[0]}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."

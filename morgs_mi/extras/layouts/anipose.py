@@ -82,7 +82,7 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
         if isinstance(table, dict) and any(k in table for k in _KEYS)
     }
     requirement = f"expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}"
-    require(entries, str(path), requirement, "none", "export the calibration again")
+    require(entries, path, requirement, "none", "export the calibration again")
     keys = (content.keys() | tables.keys()) - entries.keys() - {"cameras"}
     warn_unread(path, keys.union(*entries.values()) - _CAMERA - _HARMLESS)
     pairs = [_camera(path, key, entry) for key, entry in entries.items()]

@@ -37,7 +37,7 @@ def read_meta(path: Path) -> dict[str, tuple[Camera, tuple[Path, ...]]]:
     meta = read_json(path)
     missing = [key for key in _KEYS if not isinstance(meta, dict) or key not in meta]
     requirement = f"expected the keys {', '.join(_KEYS)}"
-    require(not missing, str(path), requirement, f"none of {', '.join(missing)}", "export again")
+    require(not missing, path, requirement, f"none of {', '.join(missing)}", "export again")
     warn_unread(path, meta.keys() - set(_KEYS))
     frames = []
     try:
@@ -78,10 +78,10 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: it is not a NumPy archive with an array `data` [P, 6 or more] of finite numbers.
     """
-    rows = numbers(str(path), "data", read_array(path, "data"))
+    rows = numbers(path, "data", read_array(path, "data"))
     is_table = rows.ndim == 2 and rows.shape[1] >= 6 and bounded(rows)
     got = f"{rows.dtype} {rows.shape}"
-    require(is_table, str(path), "`data` must be [P, 7], finite", got, "export it again")
+    require(is_table, path, "`data` must be [P, 7], finite", got, "export it again")
     return rows[:, :3], rows[:, 3:6].astype(np.float32)
 
 

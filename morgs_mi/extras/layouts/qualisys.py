@@ -85,7 +85,7 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
             f"{path}: expected XML, got a broken file ({error}); export it again."
         ) from None
     active = [element for element in root.iter("camera") if element.get("active", "1") != "0"]
-    require(active, str(path), "expected an element `camera` for each camera", "none", _REMEDY)
+    require(active, path, "expected an element `camera` for each camera", "none", _REMEDY)
     if serials := [
         element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"
     ]:
@@ -120,7 +120,7 @@ class _Plain(ElementTree.TreeBuilder):
 def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
     serial = element.get("serial", "")
     where = f"{path}, camera {serial!r}"
-    require(serial, str(path), "every `camera` must have a `serial`", "one without", _REMEDY)
+    require(serial, path, "every `camera` must have a `serial`", "one without", _REMEDY)
     left, top, right, bottom = _numbers(where, element, "fov_video", _EDGES)
     fu, fv, cu, cv = _numbers(where, element, "intrinsic", _PINHOLE)
     K = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, _SUBPIXELS]]) / _SUBPIXELS

@@ -88,13 +88,13 @@ def load_insert(path: str | Path) -> Build:
     path = Path(path)
     require(
         path.suffix in (".xml", ".py") and path.is_file(),
-        str(path),
+        path,
         "expected a scene to insert, FILE.xml or FILE.py",
         repr(path.suffix) if path.is_file() else "none",
         "check the path",
     )
     if path.suffix == ".xml":
-        with _mitsuba_errors_at(str(path)):
+        with _mitsuba_errors_at(path):
             scene: Any = mi.load_file(str(path))
         entries = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
         # Mitsuba adds an integrator to files without one.
@@ -138,7 +138,7 @@ def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     numbers = frame_numbers(stream)
     missing_frames = sorted(set(frames) - set(numbers))
     requirement = f"the frames must be out of {numbers[0]} to {numbers[-1]}"
-    require(not missing_frames, str(stream.path), requirement, few(missing_frames), "choose others")
+    require(not missing_frames, stream.path, requirement, few(missing_frames), "choose others")
     return sorted(set(frames))
 
 
@@ -284,7 +284,7 @@ def _sensor(camera: Camera) -> Any:
 
 
 @contextmanager
-def _mitsuba_errors_at(place: str) -> Iterator[None]:
+def _mitsuba_errors_at(place: object) -> Iterator[None]:
     """Raise `ValueError` with Mitsuba's reason in one line, without the places in its source."""
     try:
         yield

@@ -51,7 +51,7 @@ class FlowNetwork:
         is_image = len(first) == 4 and first[0] in (1, None) and first[1] in (3, None)
         require(
             is_image and shapes == [first] * 2 and (first[2] is None) == (first[3] is None),
-            str(path),
+            path,
             "expected two images [1, 3, H, W] as inputs, H and W both fixed or both open",
             written_shapes(shapes),
             "export it with one input per image",
@@ -98,7 +98,7 @@ class FlowNetwork:
         flows = [output for output in outputs if output.shape == shape]
         shapes = written_shapes(output.shape for output in outputs)
         requirement = f"expected an output {[*shape]}, the flow"
-        require(flows, str(self.path), requirement, shapes, "export another network")
+        require(flows, self.path, requirement, shapes, "export another network")
         return np.ascontiguousarray(np.moveaxis(flows[-1][0], 0, 2), dtype=np.float32)
 
 

@@ -83,7 +83,7 @@ class OnnxNetwork:
         counts = [math.prod(size or 1 for size in shape) for shape in self.inputs.values()]
         got = written_shapes(self.inputs.values())
         is_small = max(counts, default=0) <= _MAX_VALUES
-        require(is_small, str(path), requirement, got, "export it for smaller images")
+        require(is_small, path, requirement, got, "export it for smaller images")
 
     def run(self, inputs: Arrays) -> Arrays:
         """Return all outputs by name, in their order.

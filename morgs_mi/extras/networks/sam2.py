@@ -64,7 +64,7 @@ class SegmentNetwork:
         shapes = list(self._encoder.inputs.values())
         require(
             len(shapes) == 1 and len(shapes[0]) == 4 and shapes[0][1] == 3,
-            str(encoder),
+            encoder,
             f"expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}]",
             written_shapes(shapes),
             "give the encoder first, then the decoder",
@@ -76,7 +76,7 @@ class SegmentNetwork:
         outputs = self._decoder.outputs
         require(
             set(_PROMPTS[:2]) <= set(inputs) <= names and set(_RESULTS) <= set(outputs),
-            str(decoder),
+            decoder,
             f"expected a mask decoder with inputs among {', '.join(sorted(names))} and outputs "
             f"{' and '.join(_RESULTS)}",
             f"{', '.join(inputs)} and {', '.join(outputs)}",
@@ -129,7 +129,7 @@ class SegmentNetwork:
         masks, quality = (results[name] for name in _RESULTS)
         require(
             masks.ndim == 4 and quality.shape == masks.shape[:2] and len(masks) == 1,
-            str(self._decoder.path),
+            self._decoder.path,
             "expected masks [1, M, H, W] and iou_predictions [1, M]",
             f"{list(masks.shape)} and {list(quality.shape)}",
             "export the decoder again",

@@ -142,7 +142,7 @@ def build_of(path: Path, expected: str) -> Callable[..., Any]:
     with failures_in(path):
         spec.loader.exec_module(module)
     build: Any = getattr(module, "build", None)
-    require(callable(build), str(path), f"it must define `{expected}`", "none", "add that function")
+    require(callable(build), path, f"it must define `{expected}`", "none", "add that function")
     return build
 
 

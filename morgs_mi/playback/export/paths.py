@@ -183,7 +183,7 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
         ValueError: the file is not JSON, or a key is not as described.
     """
     document = read_json(existing_file(file, "a camera path"))
-    place = str(file)
+    place = file
     try:
         views = []
         times = []
@@ -192,7 +192,7 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
             key = {**document, **entry}
             times.append(float(key["time"]))
             views.append(_key_view(key, cameras))
-        place = str(file)
+        place = file
         return CameraPath(np.asarray(times), tuple(views))
     except (KeyError, ValueError, TypeError, OverflowError) as error:
         raise ValueError(
