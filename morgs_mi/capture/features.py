@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera, unit_vectors
-from morgs_mi.core.rig import positions_of
+from morgs_mi.core.rig import central_distances, positions_of
 
 # Larger images add no corners that other views also see, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
@@ -141,26 +141,21 @@ def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list
     ranks = distances.argsort(axis=1).argsort(axis=1)
     matches = []
     for i, j in combinations(range(count), 2):
-        if min(ranks[i, j], ranks[j, i]) <= neighbours:
-            matches.append(Match((i, j), _matches(features[i], features[j])))
-    return [match for match in matches if len(match.features)]
-
-
-def _matches(a: Features, b: Features) -> np.ndarray:
-    """Return the pairs [M, 2] of `mutual_neighbours` with a common epipolar geometry."""
-    none = np.zeros((0, 2), int)
-    if min(len(a.points), len(b.points)) < 2:
-        return none
-    pairs = mutual_neighbours(descriptor_distances(a, b))
-    inliers = None
-    if len(pairs) >= _MIN_MATCHES:
+        a = features[i]
+        b = features[j]
+        is_near = min(ranks[i, j], ranks[j, i]) <= neighbours
+        if not is_near or min(len(a.points), len(b.points)) < 2:
+            continue
+        pairs = mutual_neighbours(descriptor_distances(a, b))
+        if len(pairs) < _MIN_MATCHES:
+            continue
         x = a.points[pairs[:, 0]]
         y = b.points[pairs[:, 1]]
         with suppress(cv2.error):  # raised for some matches that fit no geometry
             _, inliers = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
-    if inliers is None or np.count_nonzero(inliers) < _MIN_MATCHES:
-        return none
-    return pairs[inliers.ravel() > 0]
+            if np.count_nonzero(inliers) >= _MIN_MATCHES:
+                matches.append(Match((i, j), pairs[inliers.ravel() > 0]))
+    return matches
 
 
 def descriptor_distances(a: Features, b: Features) -> np.ndarray:
@@ -217,7 +212,14 @@ def triangulate(
     tracks = join_matches(close, features)
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
-    good = _widest_angles(points, tracks.ids, tracks.views, cameras) >= MIN_ANGLE
+    # The spread of a point's views: twice the largest angle between its rays and their mean.
+    with np.errstate(invalid="ignore"):
+        rays = unit_vectors(points[tracks.ids] - positions_of(cameras)[tracks.views])
+        mean = unit_vectors(np.stack([np.bincount(tracks.ids, axis) for axis in rays.T], axis=1))
+        angles = np.rad2deg(np.arccos(np.clip((rays * mean[tracks.ids]).sum(1), -1, 1)))
+    widest = np.zeros(len(points))
+    np.maximum.at(widest, tracks.ids, np.nan_to_num(angles))
+    good = 2 * widest >= MIN_ANGLE
     good[tracks.ids[distances > max_error]] = False
     return points[good].astype(np.float32), tracks.mean_colors()[good].astype(np.float32)
 
@@ -256,7 +258,7 @@ def intersect(
     # Poses relative to the rig's centre and size make a system of equations well conditioned.
     positions = positions_of(cameras)
     middle = positions.mean(0)
-    scale = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    scale = central_distances(positions).max() or 1.0
     V = np.array([camera.world_to_camera[:3] for camera in cameras])
     V[:, :, 3] = (V[:, :, :3] @ middle + V[:, :, 3]) / scale
     V = V[views]
@@ -294,19 +296,3 @@ def _distances(
             projections[of_view], depths[of_view] = cameras[view].project(points[of_view])
         error = np.linalg.norm(projections - pixels, axis=1)
     return np.where((depths > 0) & np.isfinite(error), error, np.inf)
-
-
-def _widest_angles(
-    points: np.ndarray, track: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]
-) -> np.ndarray:
-    """Return twice the largest angle [P] between a point's rays and their mean, degrees: the spread
-    of its views.
-    """
-    positions = positions_of(cameras)[views]
-    with np.errstate(invalid="ignore"):
-        rays = unit_vectors(points[track] - positions)
-        mean = unit_vectors(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))
-        angle = np.rad2deg(np.arccos(np.clip((rays * mean[track]).sum(1), -1, 1)))
-    widest = np.zeros(len(points))
-    np.maximum.at(widest, track, np.nan_to_num(angle))
-    return 2 * widest

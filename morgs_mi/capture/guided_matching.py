@@ -57,20 +57,16 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     centres = np.array([a.position, b.position])
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
-    fundamental = _fundamental(a, b)
+    # The fundamental matrix, by which a pixel of `a` has its line in `b`.
+    relative = b.world_to_camera @ np.linalg.inv(a.world_to_camera)
+    essential = np.cross(relative[:3, 3], relative[:3, :3], axisb=0, axisc=0)
+    fundamental = np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
     x, y = (np.column_stack([v, np.ones(len(v))]) for v in (x, y))
     of_x = x @ fundamental.T
     of_y = y @ fundamental
     slopes = np.minimum(np.hypot(*of_x[:, :2].T)[:, None], np.hypot(*of_y[:, :2].T))
     with np.errstate(divide="ignore", invalid="ignore"):  # the epipoles have no lines
         return np.abs(of_x @ y.T) / slopes
-
-
-def _fundamental(a: Camera, b: Camera) -> np.ndarray:
-    """Return the fundamental matrix [3, 3], by which a pixel of `a` has its line in `b`."""
-    relative = b.world_to_camera @ np.linalg.inv(a.world_to_camera)
-    essential = np.cross(relative[:3, 3], relative[:3, :3], axisb=0, axisc=0)
-    return np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
 
 
 def _patches_agree(

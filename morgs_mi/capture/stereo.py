@@ -58,8 +58,16 @@ def stereo_points(
     views = [_View.of(*image) for image in images]
     cameras = [camera for camera, _, _ in images]
     batches = [np.zeros((0, 6), np.float32)]
-    for i, j in _neighbours(cameras, scene_points):
-        points = _matched(views[i], views[j], _depth_range(cameras, i, scene_points))
+    depths = scene_depths(cameras, scene_points)
+    pairs = set()  # of cameras that are close enough
+    for i, camera in enumerate(cameras):
+        angles = angles_to(camera, depths[i], cameras)
+        angles[i] = np.inf
+        for j in np.argsort(angles)[:_NEIGHBOURS].tolist():
+            if _MIN_ANGLE <= angles[j] <= _MAX_ANGLE:
+                pairs.add((min(i, j), max(i, j)))
+    for i, j in sorted(pairs):
+        points = _matched(views[i], views[j], _depth_range(cameras[i], depths[i], scene_points))
         others = [view for k, view in enumerate(views) if k not in (i, j)]
         points = _some_confirmed(rng.permutation(points), others)
         batches.append(points.astype(np.float32))
@@ -86,27 +94,12 @@ class _View:
         return cls(camera.resized(*size), small_image, cv2.blur(small_image, (3, 3)), valid)
 
 
-def _neighbours(cameras: Sequence[Camera], scene_points: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of cameras that are close enough."""
-    pairs = set()
-    for i, depth in enumerate(scene_depths(cameras, scene_points)):
-        angles = angles_to(cameras[i], depth, cameras)
-        angles[i] = np.inf
-        for j in np.argsort(angles)[:_NEIGHBOURS].tolist():
-            if _MIN_ANGLE <= angles[j] <= _MAX_ANGLE:
-                pairs.add((min(i, j), max(i, j)))
-    return sorted(pairs)
-
-
-def _depth_range(
-    cameras: Sequence[Camera], view: int, scene_points: np.ndarray
-) -> tuple[float, float]:
-    """Return the smallest and the largest depth in a view."""
-    _, _, depths = seen_points(cameras[view], scene_points)
+def _depth_range(camera: Camera, middle: float, scene_points: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest depth in a view, around `middle` if few are known."""
+    _, _, depths = seen_points(camera, scene_points)
     if len(depths) >= _KNOWN:
         near, far = np.quantile(depths, (0.02, 0.98))
         return _NEAR * float(near), _FAR * float(far)
-    middle = scene_depths(cameras, scene_points)[view]
     return middle / _BLIND, middle * _BLIND
 
 

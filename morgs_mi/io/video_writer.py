@@ -39,41 +39,36 @@ def write_video(
             back.
     """
     path = Path(path)
-    if path.suffix:
-        with atomic_path(path, "write_video()", parents=True) as partial:
-            _write_file(partial, path, frames, fps, codec)
-        return
-    with atomic_folder(path, "write_video()") as folder:
-        for i, frame in enumerate(_checked(path, frames)):
-            # Not cv2.imwrite, which does not report why it failed.
-            (folder / f"{i:04d}.png").write_bytes(png_bytes(frame))
-
-
-def _write_file(
-    partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str
-) -> None:
     frames = _checked(path, frames)
-    first = next(frames)
-    size = first.shape[1::-1]
-    fourcc = cv2.VideoWriter.fourcc(*codec)
-    encoder = cv2.VideoWriter(f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, size)
-    count = 0
-    try:
-        if not encoder.isOpened():
-            raise OSError(f"OpenCV has no encoder {codec!r} for it; try the codec FFV1 or mp4v")
-        for frame in chain([first], frames):
-            encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-            count += 1
-    finally:
-        encoder.release()
-    # OpenCV's writer reports no failure, not even a full disk, so the decodable frames are counted.
-    stream = cv2.VideoCapture(f"file:{partial}", cv2.CAP_FFMPEG)
-    readable = 0
-    while stream.grab():
-        readable += 1
-    stream.release()
-    if readable != count:
-        raise OSError(f"{count} frames were written but {readable} can be read back")
+    if not path.suffix:
+        with atomic_folder(path, "write_video()") as folder:
+            for i, frame in enumerate(frames):
+                # Not cv2.imwrite, which does not report why it failed.
+                (folder / f"{i:04d}.png").write_bytes(png_bytes(frame))
+        return
+    with atomic_path(path, "write_video()", parents=True) as partial:
+        first = next(frames)
+        size = first.shape[1::-1]
+        fourcc = cv2.VideoWriter.fourcc(*codec)
+        encoder = cv2.VideoWriter(f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, size)
+        count = 0
+        try:
+            if not encoder.isOpened():
+                raise OSError(f"OpenCV has no encoder {codec!r} for it; try the codec FFV1 or mp4v")
+            for frame in chain([first], frames):
+                encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+                count += 1
+        finally:
+            encoder.release()
+        # OpenCV's writer reports no failure, not even a full disk, so the decodable frames are
+        # counted.
+        stream = cv2.VideoCapture(f"file:{partial}", cv2.CAP_FFMPEG)
+        readable = 0
+        while stream.grab():
+            readable += 1
+        stream.release()
+        if readable != count:
+            raise OSError(f"{count} frames were written but {readable} can be read back")
 
 
 def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

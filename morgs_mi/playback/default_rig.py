@@ -138,7 +138,12 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
     ring = _ring((low + high) / 2, half, axes)
     some = thinned(next(gaussians for gaussians in frames if len(gaussians)))
-    best = int(np.argmax([_detail(some, camera.with_width(_THUMBNAIL)) for camera in ring]))
+    details = []  # mean differences between neighbouring pixels
+    for camera in ring:
+        thumbnail = camera.with_width(_THUMBNAIL)
+        image = np.array(rasterize(some, thumbnail, ("color",)).color).clip(0, 1)
+        details.append(sum(np.abs(np.diff(image, axis=axis)).mean() for axis in (0, 1)))
+    best = int(np.argmax(details))
     return ring[best:] + ring[:best]
 
 
@@ -163,12 +168,6 @@ def thinned(gaussians: Gaussians) -> Gaussians:
     k = len(gaussians) // _MOST + 1
     some = gaussians.select(np.arange(0, len(gaussians), k))
     return replace(some, log_scales=some.log_scales + 0.5 * np.log(k))
-
-
-def _detail(gaussians: Gaussians, camera: Camera) -> float:
-    """Return the mean difference between neighbouring pixels of a view."""
-    image = np.array(rasterize(gaussians, camera, ("color",)).color).clip(0, 1)
-    return sum(float(np.abs(np.diff(image, axis=axis)).mean()) for axis in (0, 1))
 
 
 def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tuple[Camera, ...]]:

@@ -491,17 +491,13 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    old_error, new_error = (_median_error(model) for model in (candidate.model, model))
-    if not new_error < (1 - _LEAST_DECREASE) * old_error:
+    medians = []
+    for each in (candidate.model, model):
+        each.update_point_3d_errors()
+        medians.append(np.median([point.error for point in each.points3D.values()] or [0]))
+    if not medians[1] < (1 - _LEAST_DECREASE) * medians[0]:
         return candidate
     return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
-
-
-def _median_error(model: Any) -> float:
-    """Return the median reprojection error of a model's points, px; 0 without points."""
-    model.update_point_3d_errors()
-    errors = [point.error for point in model.points3D.values()]
-    return float(np.median(errors)) if errors else 0.0
 
 
 @contextmanager

@@ -101,13 +101,12 @@ def write_usd(
     pxr = _pxr()
     with atomic_path(path, "write_usd()") as partial:
         try:
-            if path.suffix.lower() != ".usdz":
-                _write_stage(pxr, stream, partial, frames, half, progress)
-                return
             with TemporaryDirectory() as folder:
-                content = Path(folder) / f"{path.stem}.usdc"
+                is_package = path.suffix.lower() == ".usdz"
+                content = Path(folder) / f"{path.stem}.usdc" if is_package else partial
                 _write_stage(pxr, stream, content, frames, half, progress)
-                pxr.UsdUtils.CreateNewUsdzPackage(str(content), str(partial))
+                if is_package:
+                    pxr.UsdUtils.CreateNewUsdzPackage(str(content), str(partial))
         except pxr.Tf.ErrorException as error:
             # Errors of OpenUSD are file system errors here. The first one has the reason, the
             # others follow from it.
@@ -250,7 +249,14 @@ class _Field:
         self._state["opacities"][:] = 0
         for name, value in _values(gaussians).items():
             self._state[name][rows] = value
-        values = {**self._state, "extent": _extent(gaussians)}
+        # The corners of the box around all Gaussians.
+        extent = np.zeros((2, 3), np.float32)
+        if len(gaussians):
+            means = gaussians.numpy()["means"]
+            variances = np.diagonal(covariances(gaussians), axis1=1, axis2=2)
+            reach = _EXTENT_SIGMAS * np.sqrt(variances)
+            extent[:] = (means - reach).min(axis=0), (means + reach).max(axis=0)
+        values = {**self._state, "extent": extent}
         return sum(self._samples[name].put(state.frame, value) for name, value in values.items())
 
 
@@ -285,15 +291,6 @@ class _Samples:
             rows = np.clip(rows, -_LARGEST_HALF, _LARGEST_HALF)
         rows = np.ascontiguousarray(rows, self.dtype)
         self.attribute.Set(self.array.FromNumpy(rows), time)
-
-
-def _extent(gaussians: Gaussians) -> np.ndarray:
-    """Return the corners [2, 3] of the box around all Gaussians; zero if there are none."""
-    if not len(gaussians):
-        return np.zeros((2, 3), np.float32)
-    means = gaussians.numpy()["means"]
-    reach = _EXTENT_SIGMAS * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
-    return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]).astype(np.float32)
 
 
 def _pxr() -> Any:

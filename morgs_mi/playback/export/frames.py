@@ -23,7 +23,7 @@ _Frame = tuple[int, Arrays]
 
 
 def write_images(
-    rendered: Iterable[tuple[int, Arrays]],
+    rendered: Iterable[_Frame],
     fps: float,
     output: str | Path,
     progress: Callable[[int], None] | None = None,

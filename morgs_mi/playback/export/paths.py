@@ -137,7 +137,13 @@ def orbit(
         raise ValueError(
             f"orbit(): the camera {first.name!r} must stand beside the scene; use another path."
         )
-    degrees = _rig_width(cameras, center, up) if degrees is None else degrees
+    if degrees is None:
+        # The angle that the rig covers around the vertical.
+        arms = positions_of(cameras) - center
+        level = arms[0] - (arms[0] @ up) * up
+        bearings = np.sort(np.rad2deg(np.arctan2(arms @ np.cross(up, level), arms @ level)))
+        gap = np.diff(bearings, append=bearings[0] + 360).max()
+        degrees = 360 if gap < 90 else max(10, 360 - gap)
     check_number("orbit()", "degrees", degrees, "[1, 360]")
     start = 0 if degrees == 360 else -degrees / 2
     # The key views are about 10 degrees apart.
@@ -223,17 +229,6 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
     if not np.cross(target - position, up).any():
         raise ValueError("the view must not be along `up`")
     return _look_at(position, target, up, like)
-
-
-def _rig_width(cameras: Sequence[Camera], center: np.ndarray, up: np.ndarray) -> float:
-    """Return the angle in degrees that the rig covers around the vertical: at least 10; 360 without
-    a gap of 90.
-    """
-    arms = np.stack([camera.position - center for camera in cameras])
-    level = arms[0] - (arms[0] @ up) * up
-    angles = np.sort(np.rad2deg(np.arctan2(arms @ np.cross(up, level), arms @ level)))
-    gap = np.diff(angles, append=angles[0] + 360).max()
-    return 360 if gap < 90 else max(10, 360 - gap)
 
 
 def _look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
