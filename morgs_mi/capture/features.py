@@ -186,8 +186,7 @@ def reprojection_errors(
     pixels = np.concatenate(match.pixels(features))
     points = intersect_pairs(pixels, match.views, cameras)
     views = np.repeat(match.views, len(points))
-    errors = _distances(np.tile(points, (2, 1)), views, pixels, cameras)
-    return errors.reshape(2, -1).mean(0)
+    return _distances(np.tile(points, (2, 1)), views, pixels, cameras).reshape(2, -1).mean(0)
 
 
 def triangulate(

@@ -91,8 +91,9 @@ def load_tracks(folder: str | Path) -> Tracks:
         FileNotFoundError: the folder has none.
         ValueError: the file is broken.
     """
-    kind = "the tracks of a synthetic capture"
-    path = existing_file(Path(folder) / "tracks.npz", kind, "pass its truth folder")
+    path = existing_file(
+        Path(folder) / "tracks.npz", "the tracks of a synthetic capture", "pass its truth folder"
+    )
     points = read_array(path, "points")
     ids = read_array(path, "ids")
     prefix = "visible_"

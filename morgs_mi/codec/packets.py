@@ -245,8 +245,7 @@ def residual_packet(
     """
     config = config or CodecConfig()
     grid = previous.grid
-    N = len(grid)
-    source = np.arange(N) if source is None else np.asarray(source)
+    source = np.arange(len(grid)) if source is None else np.asarray(source)
     survivors = source[source >= 0]
     assert (gaussians.sh_degree, optional_mask(gaussians.items())) == (grid.degree, grid.optional)
     assert np.all(np.diff(survivors) > 0)
@@ -274,8 +273,7 @@ def residual_packet(
     if target:
         # The least quantizer step at which the changes are estimated to take `target` bytes.
         def fits(step: int) -> bool:
-            r = coder.rounded(step)
-            return sum(map(column_bits, coder.columns(r))) / 8 <= target
+            return sum(map(column_bits, coder.columns(coder.rounded(step)))) / 8 <= target
 
         quantizer_step = bisect_left(range(_MAX_QUANTIZER_STEP), True, quantizer_step, key=fits)
     codes = _codes(coder, quantizer_step, birth_grid)
@@ -350,8 +348,7 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
-    most_births = LIMIT - 1 - previous.next_id
-    limits = {"births": most_births, "quantizer_step": _MAX_QUANTIZER_STEP}
+    limits = {"births": LIMIT - 1 - previous.next_id, "quantizer_step": _MAX_QUANTIZER_STEP}
     births, quantizer_step = _head(packet, limits)
     code = packet.arrays["code"]
     grid = previous.grid

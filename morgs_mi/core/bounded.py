@@ -120,8 +120,9 @@ def read_bytes(path: str | Path, most: float = math.inf) -> bytes:
         ValueError: it is no regular file, or has more bytes than `most`.
     """
     size = regular(path).stat().st_size
-    remedy = "leave out what is not needed"
-    require(size <= most, path, f"expected at most {most} bytes", size, remedy)
+    require(
+        size <= most, path, f"expected at most {most} bytes", size, "leave out what is not needed"
+    )
     return Path(path).read_bytes()
 
 

@@ -67,8 +67,9 @@ def check_number(place: object, name: str, value: Any, interval: str) -> None:
     lies_in = (low <= number if interval[0] == "[" else low < number) and (
         number <= high if interval[-1] == "]" else number < high
     )
-    requirement = f"`{name}` must be a number in {interval}"
-    require(lies_in, place, requirement, repr(value), "set another value")
+    require(
+        lies_in, place, f"`{name}` must be a number in {interval}", repr(value), "set another value"
+    )
 
 
 def check_type(
@@ -86,8 +87,13 @@ def check_type(
     Raises:
         ValueError: it is not.
     """
-    requirement = f"`{name}` must be a {kind.__module__}.{kind.__qualname__}"
-    require(isinstance(value, kind), place, requirement, f"a {type(value).__name__}", remedy)
+    require(
+        isinstance(value, kind),
+        place,
+        f"`{name}` must be a {kind.__module__}.{kind.__qualname__}",
+        f"a {type(value).__name__}",
+        remedy,
+    )
 
 
 def check_size(place: str, width: Any, height: Any) -> None:

@@ -143,8 +143,7 @@ def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | Non
         ValueError: the sizes differ.
     """
     _check("endpoint_error", motion, truth, mask)
-    error = np.linalg.norm(np.asarray(motion, np.float64) - truth, axis=-1)
-    return mean_over(error, mask)
+    return mean_over(np.linalg.norm(np.asarray(motion, np.float64) - truth, axis=-1), mask)
 
 
 def iou(mask: np.ndarray, truth: np.ndarray) -> float:

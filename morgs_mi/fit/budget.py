@@ -137,7 +137,9 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
             f"{place}: `num_gaussians` must be at most {_MOST * pixels}, {_MOST} for each pixel of "
             f"the views, got {config.num_gaussians}; set a smaller number."
         )
-    views = f"{len(cameras)} views with {pixels} pixels"
     check_memory(
-        place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras"
+        place,
+        _PIXEL * pixels,
+        f"{len(cameras)} views with {pixels} pixels",
+        "fit smaller images (`downscale`), or fewer cameras",
     )

@@ -59,8 +59,7 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
         )
         height, width = is_valid.shape
         differences = np.abs(values[:height, :width] - pixel_means).max(axis=-1)
-        is_detail = (differences > max(_THRESHOLD, noise)) & is_valid
-        count += np.count_nonzero(is_detail)
+        count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & is_valid)
         values = means
         valid = fractions
         noise = noise / 2

@@ -137,8 +137,7 @@ def read_ply(path: str | Path) -> Gaussians:
                 attributes[attribute.name] = attribute.activation.inverse(values)
     else:
         vertices = as_3dgs(path, vertices)
-        rest = np.reshape(rest_names(max(K, 1)), (3, -1)).T
-        sh_order = [*_DC, *rest.ravel().tolist()]
+        sh_order = [*_DC, *np.reshape(rest_names(max(K, 1)), (3, -1)).T.ravel().tolist()]
         expected = (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION)
     if missing := [name for name in expected if name not in vertices]:
         raise ValueError(

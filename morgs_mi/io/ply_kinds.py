@@ -89,8 +89,7 @@ def as_3dgs(path: str | Path, vertices: Arrays) -> Arrays:
             raise ValueError(f"{path}: expected {expected} ({few(sorted(names))}); {remedy}.")
     unread = [name for name in vertices if not (_READ.fullmatch(name) or _HARMLESS.fullmatch(name))]
     folder = Path(path).parent
-    networks = [network.name for network in folder.glob("deformation*.pth")]
-    names = few(sorted([*unread, *networks]))
+    names = few(sorted([*unread, *[network.name for network in folder.glob("deformation*.pth")]]))
     if names and (folder, names) not in _named:
         _named.add((folder, names))
         _log.warning("%s: it is drawn without %s, which may change the image.", path, names)

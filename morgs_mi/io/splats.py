@@ -72,8 +72,7 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     count = int(N - every.sum())
     if every.any():
         middle = np.median(raw["means"][every], axis=0)
-        size = np.exp(np.median(raw["log_scales"][every]))
-        if 10 * np.spacing(np.abs(middle)).max() > size:
+        if 10 * np.spacing(np.abs(middle)).max() > np.exp(np.median(raw["log_scales"][every])):
             _log.warning(
                 "%s: the centres, around (%g, %g, %g), are so far from 0 that float32 rounds them "
                 "by a tenth of the Gaussians' sizes or more; subtract an origin before they are "

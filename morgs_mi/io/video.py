@@ -126,8 +126,7 @@ class VideoReader(_Frames):
                     packets.append((packet.pts, packet.is_discard, packet.is_corrupt))
             if first is None:
                 raise _unreadable(path, "no frame can be decoded")
-            is_upright = first.rotation % 180 == 0
-            width, height = (first.width, first.height)[:: 1 if is_upright else -1]
+            width, height = (first.width, first.height)[:: 1 if first.rotation % 180 == 0 else -1]
             fps = float(stream.guessed_rate or 0)
             shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
             # Without stamps, if a packet has none, or two have the same.

@@ -162,8 +162,7 @@ def extended_history(
     setup: Setup, frame: int, history: ImageHistory, images: Frame
 ) -> ImageHistory:
     """Return the images up to a frame, without flow; arguments and errors of `observe_frame`."""
-    recorded = copied_images(setup.cameras, images, frame, history.kind)
-    return _extended(setup, history, recorded)[0]
+    return _extended(setup, history, copied_images(setup.cameras, images, frame, history.kind))[0]
 
 
 def _extended(

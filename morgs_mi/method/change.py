@@ -104,8 +104,7 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
     sample = average.ravel()[:: max(1, average.size // 20_000)]
-    deviation = float(np.median(np.abs(sample - np.median(sample))))
-    everywhere = min(_NORMAL * deviation, _GREY_LEVEL)
+    everywhere = min(_NORMAL * float(np.median(np.abs(sample - np.median(sample)))), _GREY_LEVEL)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
     threshold = np.maximum(config.sigmas * noise, _GREY_LEVEL).astype(np.float32)
     size = np.abs(average)

@@ -146,8 +146,7 @@ def _logits(flows: _Flows, d: np.ndarray) -> np.ndarray:
     motion = flows.project(d)
     a = flows.weight / (flows.weight + _HALF_WEIGHT_PIXELS)
     gain = (a * (flows.cost(np.zeros_like(d), motion) - flows.cost(d, motion))).sum(axis=0)
-    total = a.sum(axis=0, initial=1e-6)
-    logit = _CONFIDENCE_SLOPE * (gain / total - _MIN_EVIDENCE)
+    logit = _CONFIDENCE_SLOPE * (gain / a.sum(axis=0, initial=1e-6) - _MIN_EVIDENCE)
     is_visible = np.any(np.linalg.norm(motion, axis=-1) > flows.floor, axis=0)
     return np.where(is_visible, np.clip(logit, -MAX_LOGIT, MAX_LOGIT), -MAX_LOGIT)
 

@@ -153,8 +153,7 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     gaussians = problem.gaussians
     last_motion = np.zeros_like(d) if gaussians.motion is None else np.asarray(gaussians.motion)
     if gaussians.logit_confidence is not None:
-        confident = np.asarray(gaussians.logit_confidence)[:, None] > 0
-        last_motion = np.where(confident, last_motion, 0)
+        last_motion = np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, last_motion, 0)
     if not (d.any() or last_motion.any()):
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)

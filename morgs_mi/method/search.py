@@ -190,8 +190,7 @@ def _matching_cost(target: np.ndarray, rendering: np.ndarray, weight: np.ndarray
         rows.min() : rows.max() + 1 + 2 * margin, columns.min() : columns.max() + 1 + 2 * margin
     ]
     mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
-    cost = cv2.matchTemplate(surroundings, rendering[box], cv2.TM_SQDIFF, mask=mask)
-    return np.maximum(cost, 0)
+    return np.maximum(cv2.matchTemplate(surroundings, rendering[box], cv2.TM_SQDIFF, mask=mask), 0)
 
 
 def _best_displacement(

@@ -131,11 +131,10 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     ]
     low, high = np.array(corners).T
     sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
-    size = float(np.exp(np.median(sizes)))
     # A single Gaussian has no extent but its own, and one without extent is at least larger than
     # rounding errors.
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
-    half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
+    half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * float(np.exp(np.median(sizes))), least)
     ring = _ring((low + high) / 2, half, axes)
     some = thinned(next(gaussians for gaussians in frames if len(gaussians)))
     details = []  # mean differences between neighbouring pixels
@@ -227,6 +226,5 @@ def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:
         return visible
     with np.errstate(all="ignore"):
         sizes = np.exp(raw["log_scales"][visible].max(axis=1, initial=-69))
-        radii = camera.K[0, 0] * sizes / depths
-        extent = np.ptp(pixels, axis=0).max() + 2 * np.median(radii)
+        extent = np.ptp(pixels, axis=0).max() + 2 * np.median(camera.K[0, 0] * sizes / depths)
     return visible & (extent >= _LEAST_EXTENT_SEEN * camera.width)

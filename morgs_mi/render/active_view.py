@@ -226,8 +226,7 @@ class Drawing:
         with dr.suspend_grad():
             if self.drawn is not None:
                 splats, lists = self.drawn
-                has_weight = behind is not None
-                layout = Layout((Channel(3, True),), has_weight, False, self.group.config)
+                layout = Layout((Channel(3, True),), behind is not None, False, self.group.config)
                 image, *weight = blend(
                     splats.geometry, [splats.channels["color"]], self.group.region, lists, layout
                 )

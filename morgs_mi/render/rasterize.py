@@ -369,9 +369,12 @@ def _problems(
             "tiles, one camera each"
         )
     if pixels >= _LARGE:
-        images = f"{V} x {sizes[0]} pixels"
-        remedy = "render a smaller image, or tiles, one camera each"
-        check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
+        check_memory(
+            "rasterize()",
+            _PIXEL_BYTES * pixels,
+            f"{V} x {sizes[0]} pixels",
+            "render a smaller image, or tiles, one camera each",
+        )
 
     background, features, config, region, static_splats, depth_limit, means2d = options.values()
     check_type("rasterize()", "config", config, RenderConfig)

@@ -144,8 +144,7 @@ class Recording:
         self.reports: list[FrameReport] = []
         files.provisional.unlink(missing_ok=True)
         files.settle()
-        has_predecessor = earlier is None and files.stream.exists()
-        self._written_files = files.next if has_predecessor else files
+        self._written_files = files.next if earlier is None and files.stream.exists() else files
         if earlier is None:
             stream = self._written_files.stream
             self._writer = StreamWriter(stream, capture.cameras, capture.fps, metadata)
@@ -330,8 +329,7 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
         name: value for name, value in stream.metadata.items() if name not in excluded_names
     }
     old = json.loads(header_json(stream.cameras, stream.fps, old_metadata))
-    new = json.loads(header_json(cameras, capture.fps, metadata))
-    if difference := _difference(old, new):
+    if difference := _difference(old, json.loads(header_json(cameras, capture.fps, metadata))):
         name, old_value, new_value = difference
         raise ValueError(
             f"{stream.path}: expected to resume a fit with {name} = {shortened(old_value)}, got "

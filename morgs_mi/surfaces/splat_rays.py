@@ -133,8 +133,7 @@ def _leaf_order(centers: np.ndarray, depth: int) -> tuple[np.ndarray, list[int]]
         order = order.reshape(1 << level, -1)
         groups = places[order]
         finite = np.isfinite(groups)  # those with a box
-        high = np.where(finite, groups, -np.inf).max(1)
-        extent = high - np.where(finite, groups, np.inf).min(1)
+        extent = np.where(finite, groups, -np.inf).max(1) - np.where(finite, groups, np.inf).min(1)
         axis = int(np.where(finite.any(1), extent, 0).mean(0).argmax())  # the longest on average
         flips[axis] |= 1 << (depth - 1 - level)
         partition = places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1)

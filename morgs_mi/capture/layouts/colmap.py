@@ -196,8 +196,7 @@ def write_colmap(
     with ExitStack() as files:
         for name, lines in texts.items():
             file = atomic_path(folder / f"{name}.txt", "write_colmap()", parents=True)
-            partial = files.enter_context(file)
-            partial.write_text("".join(lines), encoding="utf-8")
+            files.enter_context(file).write_text("".join(lines), encoding="utf-8")
 
 
 def _line(*fields: object) -> str:

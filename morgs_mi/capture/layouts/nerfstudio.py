@@ -210,8 +210,7 @@ def _read_calibration(path: Path) -> Calibration:
         if not {"w", "h"} <= values.keys():
             # Of another image if it is missing: its camera is left out later.
             names = [name, *(str(other.get("file_path")) for other in frames)]
-            files = (clip_of_image(path, each, clips) for each in names)
-            file = next(filter(None, files), None)
+            file = next(filter(None, (clip_of_image(path, each, clips) for each in names)), None)
             values |= zip(("w", "h"), () if file is None else size_of(file), strict=False)
         with errors_at(f"{source}, frame {index} ({name})"):
             cameras.append(_camera(values, name))

@@ -137,8 +137,7 @@ def likely_deviations(
         tracks: features of P > 0 points.
         deviations: standard deviations of the priors [11], the upper bound of the result.
     """
-    errors = _initial_estimate(cameras, tracks).errors
-    return deviations * min(1.0, _scale(errors) / _LARGE_ERROR)
+    return deviations * min(1.0, _scale(_initial_estimate(cameras, tracks).errors) / _LARGE_ERROR)
 
 
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:

@@ -300,9 +300,14 @@ def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tupl
     """
     clips = find_clips(path)
     names = names_without(path, clips, without)
-    requirement = "expected names without line feeds, as COLMAP has one image a line"
     broken = [name for name in names if "\n" in name]
-    require(not broken, path, requirement, repr(few(broken)), "rename it")
+    require(
+        not broken,
+        path,
+        "expected names without line feeds, as COLMAP has one image a line",
+        repr(few(broken)),
+        "rename it",
+    )
     if len(names) < 2:
         raise ValueError(
             f"{path}: expected the clips of at least two cameras, found "

@@ -231,9 +231,13 @@ class _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
         images = next(capture.displayed().partial_frames(0, 1)).images
         train = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
-        requirement = "expected images of at least two training views"
-        remedy = "record more, or set `refine_cameras` to off"
-        require(len(train) > 1, "refine_cameras()", requirement, len(train), remedy)
+        require(
+            len(train) > 1,
+            "refine_cameras()",
+            "expected images of at least two training views",
+            len(train),
+            "record more, or set `refine_cameras` to off",
+        )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in train.values()])
@@ -403,10 +407,9 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     masks, pixels, _ = zip(*(seen_points(camera, points) for camera in cameras), strict=True)
     pixels = map(undistorted, rig, pixels, changes[:, 9:])
-    counts = np.sum(masks, axis=0)
     views, ids = np.nonzero(masks)
     intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
-    is_determined = (counts >= 2) & np.isfinite(intersections).all(axis=1)
+    is_determined = (np.sum(masks, axis=0) >= 2) & np.isfinite(intersections).all(axis=1)
     return np.where(is_determined[:, None], intersections, points).astype(np.float32)
 
 

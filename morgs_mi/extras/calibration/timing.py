@@ -115,8 +115,13 @@ def estimate_time_offsets(
     require(cameras > 1, place, "expected at least 2 cameras to compare clocks", 1, "record more")
     clips = _Clips.of(capture, progress)
     largest = min(_LARGEST, (clips.num_frames - 2) // 2)
-    requirement = "expected at least 4 frames to compare clocks"
-    require(largest >= 1, place, requirement, clips.num_frames, "record longer")
+    require(
+        largest >= 1,
+        place,
+        "expected at least 4 frames to compare clocks",
+        clips.num_frames,
+        "record longer",
+    )
     offsets, step, equations = _aligned(clips, largest)
     reference = capture.reference_view
     # The part that the equations recover of a move of the clocks relative to the reference's.
@@ -228,11 +233,10 @@ class _Clips:
                 # There are fewer fits if a round is left out.
                 self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * _TIMESTAMPS)
         equations = reduce(add, parts)
-        requirement = f"expected motion in the first {self.num_frames} frames"
         require(
             equations.own.any(),
             self.capture.path,
-            requirement,
+            f"expected motion in the first {self.num_frames} frames",
             "none",
             "record something that moves",
         )

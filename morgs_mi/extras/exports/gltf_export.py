@@ -113,20 +113,23 @@ def glb(gaussians: Gaussians, axes: np.ndarray) -> bytes:
     document = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     document += b" " * (-len(document) % 4)
     size = 12 + 8 + len(document) + 8 + len(binary)
-    got = f"{size} of {len(gaussians)} Gaussians"
-    require(size < 2**32, "write_gltf()", "expected less than 2^32 bytes", got, "use PLY")
-    head = struct.pack("<4sII", b"glTF", 2, size)
+    require(
+        size < 2**32,
+        "write_gltf()",
+        "expected less than 2^32 bytes",
+        f"{size} of {len(gaussians)} Gaussians",
+        "use PLY",
+    )
     chunks = (
         struct.pack("<I4s", len(data), kind) + data
         for kind, data in ((b"JSON", document), (b"BIN\0", binary))
     )
-    return head + b"".join(chunks)
+    return struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks)
 
 
 def _attributes(gaussians: Gaussians) -> Arrays:
     raw = gaussians.numpy()
-    opacities = np.asarray(gaussians.opacities, np.float32)
-    alpha = np.clip(opacities, 0, 1)[:, None]
+    alpha = np.clip(np.asarray(gaussians.opacities, np.float32), 0, 1)[:, None]
     coefficients = raw["sh_coeffs"]
     # Mean colour in linear light.
     color = decode_light(np.clip(0.5 + SH_C0 * coefficients[:, 0], 0, 1))

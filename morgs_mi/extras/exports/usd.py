@@ -307,6 +307,11 @@ def _pxr() -> Any:
             f"write_usd(): expected the package usd-core, found none; {_INSTALL}."
         ) from error
     version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
-    has_schema = hasattr(modules.UsdVol, "ParticleField3DGaussianSplat")
-    require(has_schema, "write_usd()", "expected OpenUSD 26.3 or newer", version, _INSTALL)
+    require(
+        hasattr(modules.UsdVol, "ParticleField3DGaussianSplat"),
+        "write_usd()",
+        "expected OpenUSD 26.3 or newer",
+        version,
+        _INSTALL,
+    )
     return modules

@@ -175,8 +175,13 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
             f"{first[None]}: expected one folder, or {kinds}, got another; convert it."
         )
     names = " and ".join(path.name for path in first.values())
-    remedy = "name the files of one of them"
-    require(len(first) == 1, place, "expected frames of one format", names, remedy)
+    require(
+        len(first) == 1,
+        place,
+        "expected frames of one format",
+        names,
+        "name the files of one of them",
+    )
     return paths
 
 

@@ -81,8 +81,13 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
         for key, table in tables.items()
         if isinstance(table, dict) and any(k in table for k in _KEYS)
     }
-    requirement = f"expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}"
-    require(entries, path, requirement, "none", "export the calibration again")
+    require(
+        entries,
+        path,
+        f"expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}",
+        "none",
+        "export the calibration again",
+    )
     keys = (content.keys() | tables.keys()) - entries.keys() - {"cameras"}
     warn_unread(path, keys.union(*entries.values()) - _CAMERA - _HARMLESS)
     pairs = [_camera(path, key, entry) for key, entry in entries.items()]
@@ -92,11 +97,21 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
 def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Lens]:
     where = f"{path}, table [{key}]"
     name = entry.get("name", key if key.startswith("cam") else f"cam_{key}")
-    is_text = isinstance(name, str | int) and name != ""
-    require(is_text, where, "`name` must be a text", shortened(name), "name the camera as its clip")
+    require(
+        isinstance(name, str | int) and name != "",
+        where,
+        "`name` must be a text",
+        shortened(name),
+        "name the camera as its clip",
+    )
     width, height = _array(where, entry, "size", (2,)).tolist()
-    is_whole = width.is_integer() and height.is_integer()
-    require(is_whole, where, "`size` must be whole pixels [w, h]", entry["size"], "calibrate again")
+    require(
+        width.is_integer() and height.is_integer(),
+        where,
+        "`size` must be whole pixels [w, h]",
+        entry["size"],
+        "calibrate again",
+    )
     K = _array(where, entry, "matrix", (3, 3)).copy()
     K[:2, 2] += 0.5
     rotation = _array(where, entry, "rotation", (3,), (3, 3))

@@ -64,8 +64,13 @@ def read_meta(path: Path) -> dict[str, tuple[Camera, tuple[Path, ...]]]:
             changes = np.abs(values - values[0]).max((1, 2))
             moving = ~(changes <= 1e-4 * (1 + np.abs(values[0]).max()))  # also where it is NaN
             requirement = f"the {what} in frame {moving.argmax()} must equal that in frame 0"
-            remedy = "use a recording of fixed cameras, as moving cameras are not supported"
-            require(not moving.any(), where, requirement, values[moving.argmax()].tolist(), remedy)
+            require(
+                not moving.any(),
+                where,
+                requirement,
+                values[moving.argmax()].tolist(),
+                "use a recording of fixed cameras, as moving cameras are not supported",
+            )
         with errors_at(where):
             camera = Camera(K[0], viewmat, meta["w"], meta["h"], name=name)
         cameras[name] = camera, tuple(path.parent / "ims" / str(file) for file in files)
@@ -79,9 +84,13 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ValueError: it is not a NumPy archive with an array `data` [P, 6 or more] of finite numbers.
     """
     rows = numbers(path, "data", read_array(path, "data"))
-    is_table = rows.ndim == 2 and rows.shape[1] >= 6 and bounded(rows)
-    got = f"{rows.dtype} {rows.shape}"
-    require(is_table, path, "`data` must be [P, 7], finite", got, "export it again")
+    require(
+        rows.ndim == 2 and rows.shape[1] >= 6 and bounded(rows),
+        path,
+        "`data` must be [P, 7], finite",
+        f"{rows.dtype} {rows.shape}",
+        "export it again",
+    )
     return rows[:, :3], rows[:, 3:6].astype(np.float32)
 
 

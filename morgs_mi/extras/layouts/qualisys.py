@@ -146,8 +146,13 @@ def _numbers(where: str, camera: Element, name: str, keys: Sequence[str]) -> lis
             numbers.append(float(text))
         except ValueError:
             numbers.append(np.nan)
-        requirement = f"`{key}` of `{name}` must be a finite number of at most {LARGEST:g}"
-        require(bounded(numbers[-1]), where, requirement, text, "calibrate in QTM and export again")
+        require(
+            bounded(numbers[-1]),
+            where,
+            f"`{key}` of `{name}` must be a finite number of at most {LARGEST:g}",
+            text,
+            "calibrate in QTM and export again",
+        )
     return numbers
 
 

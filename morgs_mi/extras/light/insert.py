@@ -137,8 +137,13 @@ def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     """
     numbers = frame_numbers(stream)
     missing_frames = sorted(set(frames) - set(numbers))
-    requirement = f"the frames must be out of {numbers[0]} to {numbers[-1]}"
-    require(not missing_frames, stream.path, requirement, few(missing_frames), "choose others")
+    require(
+        not missing_frames,
+        stream.path,
+        f"the frames must be out of {numbers[0]} to {numbers[-1]}",
+        few(missing_frames),
+        "choose others",
+    )
     return sorted(set(frames))
 
 
@@ -175,8 +180,7 @@ def render_inserted(
     view = camera.square()
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
-            entries = build(frame, frame / stream.fps)
-            images = _render(gaussians, view, entries, channels, config)
+            images = _render(gaussians, view, build(frame, frame / stream.fps), channels, config)
             if view.height != camera.height:
                 for name, image in images.items():
                     values = cv2.resize(image, camera.size, interpolation=cv2.INTER_LINEAR)
@@ -254,8 +258,9 @@ def _lit_scenes(
         ValueError: it has no shapes, or they are not finite.
     """
     scene: Any = mi.load_dict({"type": "scene", **entries})
-    parts = scene.shapes() or scene.emitters()
-    require(parts, _PLACE, "expected at least one shape", "none", "add one")
+    require(
+        scene.shapes() or scene.emitters(), _PLACE, "expected at least one shape", "none", "add one"
+    )
     box = scene.bbox()
     require(
         not scene.shapes() or bounded(np.array([box.min, box.max])),
@@ -268,8 +273,7 @@ def _lit_scenes(
         return scene, scene
     image = np.asarray(rasterize(gaussians, camera, ("color",)).color)
     color = np.clip(image, 0, np.inf if clipped == 1 else 1.0).mean((0, 1)).tolist()
-    center = np.array(box.center()).ravel()
-    lamp = light_probe(gaussians, center, background=color, clipped=clipped)
+    lamp = light_probe(gaussians, np.array(box.center()).ravel(), background=color, clipped=clipped)
     lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
     if light == "probe":
         return lit_scene, lit_scene
@@ -331,8 +335,13 @@ def shadow_ratio(
     eye = check_point(place, "viewpoint", viewpoint)
     emitters = scene.emitters()
     shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
-    remedy = "add one, such as an `envmap` of morgs_mi.light_probe()"
-    require(emitters, place, "expected a scene with an emitter", "none", remedy)
+    require(
+        emitters,
+        place,
+        "expected a scene with an emitter",
+        "none",
+        "add one, such as an `envmap` of morgs_mi.light_probe()",
+    )
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():

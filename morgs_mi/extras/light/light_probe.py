@@ -101,8 +101,7 @@ def check_point(place: str, name: str, point: ArrayLike) -> np.ndarray:
     """Return an argument as a finite point [3]; anything else raises `ValueError`."""
     point = numbers(place, name, point).astype(np.float64)
     is_point = point.shape == (3,) and np.isfinite(point).all()
-    requirement = f"`{name}` must be [3] and finite"
-    require(is_point, place, requirement, point.tolist(), "pass x, y and z")
+    require(is_point, place, f"`{name}` must be [3] and finite", point.tolist(), "pass x, y and z")
     return point
 
 

@@ -105,8 +105,13 @@ class SplatPathIntegrator(common.RBIntegrator):
         **_: Any,
     ) -> tuple[Any, Bool, list[Float], Any]:
         """Return radiance or its derivative, as `ADIntegrator.sample` does."""
-        remedy = "set it as the `surfaces` of a `gaussian_splat`, which passes its own"
-        require(self.splats, "splat_path", "expected Gaussians", "none", remedy)
+        require(
+            self.splats,
+            "splat_path",
+            "expected Gaussians",
+            "none",
+            "set it as the `surfaces` of a `gaussian_splat`, which passes its own",
+        )
         primal = mode == dr.ADMode.Primal
         ctx = mi.BSDFContext()
         sign = 1 if primal else -1
@@ -185,8 +190,7 @@ class SplatPathIntegrator(common.RBIntegrator):
             β = dr.select(roulette, β * dr.rcp(survival), β)
             is_delta: Any = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
             depth = dr.select(si.is_valid(), depth + 1, depth)
-            last_si = dr.detach(si)
-            end = _Path(onwards, depth, L, δL, β, η, last_si, direction_sample.pdf, is_delta)
+            end = _Path(onwards, depth, L, δL, β, η, dr.detach(si), direction_sample.pdf, is_delta)
             return proceed, sampler, end
 
         start = _Path(

@@ -137,7 +137,6 @@ def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
     """Start the viewer in a process of its own: in one process it would wait for the renderings of
     the fit.
     """
-    opening = "--browser" if browser else "--no-browser"
     command = [
         sys.executable,
         "-m",
@@ -145,7 +144,7 @@ def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
         "view",
         str(out),
         "--follow",
-        opening,
+        "--browser" if browser else "--no-browser",
         "--variant",
         mi.variant(),
     ]

@@ -96,9 +96,13 @@ class FlowNetwork:
         shape = (1, 2, *image.shape[:2])
         # A network that returns the flow of each of its iterations returns the best one last.
         flows = [output for output in outputs if output.shape == shape]
-        shapes = written_shapes(output.shape for output in outputs)
-        requirement = f"expected an output {[*shape]}, the flow"
-        require(flows, self.path, requirement, shapes, "export another network")
+        require(
+            flows,
+            self.path,
+            f"expected an output {[*shape]}, the flow",
+            written_shapes(output.shape for output in outputs),
+            "export another network",
+        )
         return np.ascontiguousarray(np.moveaxis(flows[-1][0], 0, 2), dtype=np.float32)
 
 

@@ -45,8 +45,13 @@ class Lpips:
         self.path = Path(path)
         self._network = OnnxNetwork(path)
         names = self._network.inputs
-        requirement = f"expected a network with inputs {' and '.join(_INPUTS)}"
-        require({*names} == {*_INPUTS}, path, requirement, ", ".join(names), _ADVICE)
+        require(
+            {*names} == {*_INPUTS},
+            path,
+            f"expected a network with inputs {' and '.join(_INPUTS)}",
+            ", ".join(names),
+            _ADVICE,
+        )
 
     def distance_map(self, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         """Return the distance per pixel [H, W], or of the whole image [1, 1] if the network returns
@@ -67,7 +72,11 @@ class Lpips:
             for name, each in zip(_INPUTS, pair, strict=True)
         }
         distance = next(iter(self._network.run(blobs).values()))
-        requirement = f"expected one distance, or one for each of {W}x{H} pixels"
-        is_map = distance.size in (1, H * W)
-        require(is_map, self.path, requirement, list(distance.shape), _ADVICE)
+        require(
+            distance.size in (1, H * W),
+            self.path,
+            f"expected one distance, or one for each of {W}x{H} pixels",
+            list(distance.shape),
+            _ADVICE,
+        )
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))

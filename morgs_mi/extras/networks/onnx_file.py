@@ -79,11 +79,14 @@ class OnnxNetwork:
                 f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it "
                 "again."
             ) from error
-        requirement = f"expected inputs of at most {_MAX_VALUES} values"
         counts = [math.prod(size or 1 for size in shape) for shape in self.inputs.values()]
-        got = written_shapes(self.inputs.values())
-        is_small = max(counts, default=0) <= _MAX_VALUES
-        require(is_small, path, requirement, got, "export it for smaller images")
+        require(
+            max(counts, default=0) <= _MAX_VALUES,
+            path,
+            f"expected inputs of at most {_MAX_VALUES} values",
+            written_shapes(self.inputs.values()),
+            "export it for smaller images",
+        )
 
     def run(self, inputs: Arrays) -> Arrays:
         """Return all outputs by name, in their order.
@@ -105,12 +108,21 @@ class OnnxNetwork:
             ) from error
         arrays: dict[str, Any] = dict(zip(self.outputs, results, strict=True))
         for name, value in arrays.items():
-            is_array = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
             place = f"{self.path}, output {name}"
-            require(is_array, place, "expected numbers", kind_of(value), "export again")
-            remedy = "check the value range, or export it in float32"
-            is_finite = np.isfinite(value).all()
-            require(is_finite, place, "expected finite numbers", "NaN or infinity", remedy)
+            require(
+                isinstance(value, np.ndarray) and value.dtype.kind in "biuf",
+                place,
+                "expected numbers",
+                kind_of(value),
+                "export again",
+            )
+            require(
+                np.isfinite(value).all(),
+                place,
+                "expected finite numbers",
+                "NaN or infinity",
+                "check the value range, or export it in float32",
+            )
         return arrays
 
 

@@ -116,11 +116,10 @@ class SegmentNetwork:
         points, labels = prompts(component)
         # The decoder adds half a pixel: its pixel centres have whole coordinates.
         scale = np.array((input_width / width, input_height / height), np.float32)
-        coordinates = points * scale - np.float32(0.5)
         quarter = input_height // _MASK_SHRINK, input_width // _MASK_SHRINK
         inputs = {
             **features,
-            "point_coords": coordinates[None],
+            "point_coords": (points * scale - np.float32(0.5))[None],
             "point_labels": labels[None],
             "mask_input": np.zeros((1, 1, *quarter), np.float32),
             "has_mask_input": np.zeros(1, np.float32),
@@ -173,8 +172,12 @@ def prompts(
 def sam2(files: str, config: MaskConfig) -> MaskRefiner:
     """Return the mask refiner of two files, ENCODER.onnx,DECODER.onnx."""
     encoder, _, decoder = files.partition(",")
-    requirement = "`mask_method` must be sam2:ENCODER.onnx,DECODER.onnx"
-    got = repr(f"sam2:{files}")
-    require(encoder and decoder, "MotionConfig()", requirement, got, "name both files")
+    require(
+        encoder and decoder,
+        "MotionConfig()",
+        "`mask_method` must be sam2:ENCODER.onnx,DECODER.onnx",
+        repr(f"sam2:{files}"),
+        "name both files",
+    )
     network = SegmentNetwork(encoder, decoder, config.prompts)
     return lambda image, mask: mask | network(image, clean_mask(mask))

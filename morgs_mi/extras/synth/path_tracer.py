@@ -99,10 +99,13 @@ class PathTracer:
         for name, light in scene.lights.items():
             if light.pose is not None:
                 key = f"{name}.to_world"
-                where = f"scene {scene.name!r}, light {name!r}"
-                requirement = "a lamp with a pose must be a shape with an emitter, e.g. a rectangle"
-                remedy = "use one, or leave out the pose"
-                require(key in self._params, where, requirement, light.shape["type"], remedy)
+                require(
+                    key in self._params,
+                    f"scene {scene.name!r}, light {name!r}",
+                    "a lamp with a pose must be a shape with an emitter, e.g. a rectangle",
+                    light.shape["type"],
+                    "use one, or leave out the pose",
+                )
                 transform = np.array(self._params[key].matrix, float).reshape(4, 4)
                 self._lamps[key] = (light.pose, transform)
         self._exposure = 1.0

@@ -193,8 +193,13 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
                     ids = [name, f"{name}_group"]
                 _check_values(where, item.shapes)
             twice = names & {*ids}
-            requirement = "its names in Mitsuba must be its own"
-            require(not twice, where, requirement, f"{sorted(twice)} twice", "rename one")
+            require(
+                not twice,
+                where,
+                "its names in Mitsuba must be its own",
+                f"{sorted(twice)} twice",
+                "rename one",
+            )
             names.update(ids)
             pose: Any = item.pose
             for time in times if pose else ():

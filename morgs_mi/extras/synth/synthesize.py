@@ -102,9 +102,12 @@ def synthesize(
     )
     config = config or SynthConfig()
     check_ranges(config, "synthesize()")
-    size = f"images of {config.width}x{config.height} pixels"
-    memory = _PIXEL_BYTES * config.width * config.height
-    check_memory("synthesize()", memory, size, "make them smaller (`width`, `height`)")
+    check_memory(
+        "synthesize()",
+        _PIXEL_BYTES * config.width * config.height,
+        f"images of {config.width}x{config.height} pixels",
+        "make them smaller (`width`, `height`)",
+    )
     scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
     completed = config.completed(scene.recording)
     assert completed.cameras is not None
@@ -243,12 +246,22 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
     black images.
     """
     where = f"scene {tracer.scene.name!r}"
-    remedy = "give it lights, e.g. `lights()` of morgs_mi.extras.synth.textures"
-    require(tracer.has_emitters, where, "expected an emitter", "none, for black images", remedy)
+    require(
+        tracer.has_emitters,
+        where,
+        "expected an emitter",
+        "none, for black images",
+        "give it lights, e.g. `lights()` of morgs_mi.extras.synth.textures",
+    )
     for camera in cameras:
         sees_objects = (tracer.surface_points(camera).ids >= 0).any()
-        requirement = f"{camera.name} must see an object at 0 s"
-        require(sees_objects, where, requirement, "none", "move the objects or the rig")
+        require(
+            sees_objects,
+            where,
+            f"{camera.name} must see an object at 0 s",
+            "none",
+            "move the objects or the rig",
+        )
     if not tracer.render(cameras[0], 1, 0).any():
         _LOG.warning(
             "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the "
@@ -296,10 +309,8 @@ def _sample_tracks(
         for camera in cameras:
             surface = tracer.surface_points(camera)
             for moving in (False, True):
-                mask = (surface.ids >= 0) & (can_move[surface.ids] == moving)
-                pixels = np.flatnonzero(mask)
-                choice = rng.choice(pixels, min(share, len(pixels)), replace=False)
-                sample = surface.pick(choice)
+                pixels = np.flatnonzero((surface.ids >= 0) & (can_move[surface.ids] == moving))
+                sample = surface.pick(rng.choice(pixels, min(share, len(pixels)), replace=False))
                 paths = [move_with_objects(sample, poses[start], pose) for pose in poses]
                 points.append(np.stack(paths, axis=1))
                 owners.append(sample.ids)
@@ -341,8 +352,7 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
         # Structure from motion has an error of about half a pixel; here it is the same along the
         # ray.
         pixel_width = depths[choice, None] / camera.K[0, 0]
-        noise = rng.normal(size=(len(choice), 3))
-        points.append(positions[choice] + noise * (0.5 * pixel_width))
+        points.append(positions[choice] + rng.normal(size=(len(choice), 3)) * (0.5 * pixel_width))
         image = next(open_frames(clips[index]).frames(0, 1))
         image = image if lens is None else lens(image)
         colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)

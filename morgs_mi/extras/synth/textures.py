@@ -44,8 +44,7 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np
     tint = np.stack([fractal(rng, _SIZE, finest) for _ in range(3)], axis=-1)
     x = np.arange(_SIZE) * cells // _SIZE
     checker = np.where(((x[:, None] + x) % 2)[..., None] == 1, first, second)
-    texture = checker * np.exp(0.35 * shade + 0.10 * tint)
-    return np.clip(texture, 0.03, 0.85).astype(np.float32)
+    return np.clip(checker * np.exp(0.35 * shade + 0.10 * tint), 0.03, 0.85).astype(np.float32)
 
 
 def textured(

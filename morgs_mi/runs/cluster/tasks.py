@@ -80,9 +80,8 @@ class ChunkConfig:
 
 def recording_of(capture: Capture) -> Callable[[], Capture]:
     """Return the function with which every worker opens a capture, at its absolute path."""
-    path = str(capture.path.resolve())
     settings = (capture.downscale, capture.test_views, capture.num_frames, capture.reading)
-    return partial(load_capture, path, *settings)
+    return partial(load_capture, str(capture.path.resolve()), *settings)
 
 
 @dataclass(frozen=True)

@@ -141,8 +141,7 @@ def _worker() -> Any:
 
 def installed() -> tuple[tuple[str, str], ...]:
     """Return the versions that must be the same in client and workers."""
-    python = ".".join(platform.python_version_tuple()[:2])
-    return tuple({**versions(), "python": python}.items())
+    return tuple({**versions(), "python": ".".join(platform.python_version_tuple()[:2])}.items())
 
 
 @contextmanager
