@@ -14,10 +14,8 @@ import logging
 import math
 import os
 import stat
-import tokenize
 import tomllib
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -30,20 +28,6 @@ from morgs_mi.core.checks import few, require
 
 _FACTOR = 10
 _ALLOWANCE = 200_000_000
-# Errors of parsers for broken files. NumPy parses headers as Python.
-_BROKEN = (
-    ValueError,
-    TypeError,
-    EOFError,
-    KeyError,
-    MemoryError,
-    RuntimeError,  # also of too deep a recursion
-    OverflowError,
-    SyntaxError,
-    zipfile.BadZipFile,
-    zlib.error,
-    tokenize.TokenError,
-)
 MAX_TOML = 256_000
 """Most bytes of a TOML file."""
 MAX_JSON = 64_000_000
@@ -208,10 +192,12 @@ def array_names(path: str | Path) -> list[str]:
 
 @contextmanager
 def _refusing(path: str | Path, expected: str, remedy: str) -> Iterator[None]:
-    """Raise the errors of a parser as an error of the file."""
+    """Raise the errors of a parser, which may be of any class, as an error of the file."""
     try:
         yield
-    except _BROKEN as error:
+    except OSError:
+        raise
+    except Exception as error:
         raise ValueError(
             f"{path}: expected {expected}, got a broken file ({error}); {remedy}."
         ) from None

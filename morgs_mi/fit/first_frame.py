@@ -201,7 +201,7 @@ def fit_first_frame(
 
     def losses_at(parameters: Tensors, view: int) -> Tensors:
         gaussians = dropped(start.with_parameters(parameters), config.dropout or 0.0, rng)
-        image = views[view].render(gaussians, ("color",))
+        image = views[view].render(gaussians)
         return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
 
     control = DensityControl(problem.cameras, config.density, problem.extent, rng)

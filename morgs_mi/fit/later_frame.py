@@ -232,7 +232,7 @@ def _fit_motion(
 
     def losses_at(parameters: Tensors, index: int) -> Tensors:
         view = problem.active.views[index]
-        image = view.render(moved(start_gaussians, *model.motion(parameters)), ("color",))
+        image = view.render(moved(start_gaussians, *model.motion(parameters)))
         return {
             "recon": recon_loss(image.color, problem.targets[index], dssim_weight, view.region),
             **model.losses(parameters),

@@ -144,8 +144,13 @@ def calibration_files(path: Path, pattern: str) -> list[Path]:
     ]
 
 
-def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
-    """Return the only calibration of a capture.
+def only_calibration(
+    path: Path,
+    files: Sequence[Path],
+    expected: str,
+    read: Callable[[Path], tuple[Sequence[Camera], Sequence[Lens]]],
+) -> Calibration:
+    """Return what `read` reads from the only calibration of a capture; raises as `match_clips`.
 
     Raises:
         ValueError: there are several.
@@ -155,7 +160,8 @@ def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
         raise ValueError(
             f"{path}: expected {expected}, got {names}; keep the one of this recording."
         )
-    return files[0]
+    cameras, lenses = read(files[0])
+    return match_clips(path, files[0], required_clips(path), cameras, lenses)[0]
 
 
 def required_clips(path: Path) -> Mapping[str, Clip]:

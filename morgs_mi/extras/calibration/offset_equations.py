@@ -134,7 +134,7 @@ def offset_equations(
     means = np.asarray(gaussians.means, np.float64)[moving]
     products = []
     for view, target in zip(views, targets, strict=True):
-        error = blurred(target.difference(view.render(gaussians, ("color",)).color), blur)
+        error = blurred(target.difference(view.render(gaussians).color), blur)
         gradient = image_gradient(blurred(target.image(), blur))
         products.append(gradient_products(gaussians, view, error, gradient))
     A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))

@@ -25,9 +25,7 @@ from morgs_mi.capture.layouts.calibration import (
     Calibration,
     Reader,
     calibration_files,
-    match_clips,
     only_calibration,
-    required_clips,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import MAX_TOML, read_text, read_toml, warn_unread
@@ -158,9 +156,8 @@ def _calibration_files(path: Path) -> list[Path]:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    source = only_calibration(path, _calibration_files(path), "one calibration in TOML")
-    cameras, lenses = read_anipose(source)
-    return match_clips(path, source, required_clips(path), cameras, lenses)[0]
+    files = _calibration_files(path)
+    return only_calibration(path, files, "one calibration in TOML", read_anipose)
 
 
 READER = Reader(

@@ -28,9 +28,7 @@ from morgs_mi.capture.layouts.calibration import (
     PoseConvention,
     Reader,
     calibration_files,
-    match_clips,
     only_calibration,
-    required_clips,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import check_claim, read_bytes, warn_unread
@@ -158,9 +156,8 @@ def _numbers(where: str, camera: Element, name: str, keys: Sequence[str]) -> lis
 
 def _read_calibration(path: Path) -> Calibration:
     """Return the cameras that have a clip; marker cameras have none."""
-    source = only_calibration(path, calibration_files(path, _PATTERN), "one file *.qca.txt")
-    cameras, lenses = read_qualisys(source)
-    return match_clips(path, source, required_clips(path), cameras, lenses)[0]
+    files = calibration_files(path, _PATTERN)
+    return only_calibration(path, files, "one file *.qca.txt", read_qualisys)
 
 
 READER = Reader(

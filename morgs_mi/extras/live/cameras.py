@@ -148,7 +148,8 @@ class CameraFeed:
         # The first images have to be complete, and so have the last ones. Otherwise a camera that
         # runs is waited for, unless it is late or was missing before; an image of another has to be
         # of the time of the newest.
-        recent = _simultaneous(new)
+        last = max((shots[-1].time for shots in new if shots), default=0.0)
+        recent = [bool(shots) and last - shots[-1].time <= _MAX_SKEW for shots in new]
         expected = [after is None or after.images[k] is not None for k in range(len(new))]
         if after is not None and is_running:
             for k, camera in enumerate(self._cameras):
@@ -235,12 +236,6 @@ class _Camera(Thread):
             with self._change:
                 self.reason = str(self.error or self._end_text)
                 self._change.notify_all()
-
-
-def _simultaneous(new: Sequence[Sequence[Shot]]) -> list[bool]:
-    """Return for each camera whether its newest shot fits into a frame set with the newest."""
-    last = max((shots[-1].time for shots in new if shots), default=0.0)
-    return [bool(shots) and last - shots[-1].time <= _MAX_SKEW for shots in new]
 
 
 def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Shot | None] | None:

@@ -61,23 +61,19 @@ def open_feed(
     videos = [source for source in sources if is_video(source)]
     text = f"{len(sources)} ({', '.join(map(str, sources))})"
     rig = f"the {len(names)} calibrated cameras ({', '.join(names)})"
-    for holds, requirement, got, remedy in (
-        (sources, "`camera` must have a source per camera", "none", "name them"),
-        (
-            len(set(sources)) == len(sources),
-            "`camera` must have different sources",
-            text,
-            "name each once",
-        ),
-        (
-            len(names) == len(sources),
-            f"`camera` must have a source for each of {rig}",
-            text,
-            "name them in that order",
-        ),
-        (videos or not config.loop, "`loop` repeats videos", f"none in {text}", "leave it out"),
-    ):
-        require(holds, "open_feed()", requirement, got, remedy)
+    place = "open_feed()"
+    require(sources, place, "`camera` must have a source per camera", "none", "name them")
+    are_different = len(set(sources)) == len(sources)
+    require(are_different, place, "`camera` must have different sources", text, "name each once")
+    require(
+        len(names) == len(sources),
+        place,
+        f"`camera` must have a source for each of {rig}",
+        text,
+        "name them in that order",
+    )
+    can_repeat = videos or not config.loop
+    require(can_repeat, place, "`loop` repeats videos", f"none in {text}", "leave it out")
     stop = Event()
     clock = ClipClock(len(videos))
 

@@ -48,13 +48,11 @@ class SynthConfig:
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings, with the scene's own values for missing ones."""
-        defaults = {
-            "cameras": recording.num_cameras,
-            "spp": recording.spp,
-            "noise": recording.noise,
-        }
         return replace(
-            self, **{name: value for name, value in defaults.items() if getattr(self, name) is None}
+            self,
+            cameras=self.cameras or recording.num_cameras,
+            spp=self.spp or recording.spp,
+            noise=recording.noise if self.noise is None else self.noise,
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -129,7 +129,12 @@ def synthesize(
             )
     check_scene(scene, rig.times())
     out = Path(out)
-    _check_folder(out, overwrite)
+    is_empty = out.is_dir() and all(is_added(file.name) for file in out.iterdir())
+    # Recordings and fits have a `capture.json` too.
+    is_synthetic = {"scene", "spp"} <= set(stored_settings(out))
+    if out.exists() and not is_empty and not (overwrite and is_synthetic):
+        reason = "is not a synthetic capture" if overwrite else "is not empty"
+        raise FileExistsError(f"synthesize(): {out} {reason}; choose another folder.")
     check_output(out.resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
@@ -361,16 +366,6 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     write_colmap(
         folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses
     )
-
-
-def _check_folder(out: Path, overwrite: bool) -> None:
-    """Raise `FileExistsError` if `out` must not be replaced."""
-    is_empty = out.is_dir() and all(is_added(file.name) for file in out.iterdir())
-    # Recordings and fits have a `capture.json` too.
-    is_synthetic = {"scene", "spp"} <= set(stored_settings(out))
-    if out.exists() and not is_empty and not (overwrite and is_synthetic):
-        reason = "is not a synthetic capture" if overwrite else "is not empty"
-        raise FileExistsError(f"synthesize(): {out} {reason}; choose another folder.")
 
 
 def stored_settings(folder: Path) -> dict[str, Any]:
