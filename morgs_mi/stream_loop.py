@@ -120,12 +120,11 @@ def step(
     if state.coded is None:
         for problem in problems:
             _LOG.warning("frame 0: %s", problem)
-    sentences = [*([] if fitted.status == "ok" else [fitted.status]), *problems]
     later_exposures = observation.history.exposures
     report = replace(
         fitted,
         seconds=time.perf_counter() - start_time,
-        status="; ".join(sentences) or "ok",
+        status="; ".join([*([] if fitted.status == "ok" else [fitted.status]), *problems]) or "ok",
         missing_views=tuple(missing),
         exposures=tuple(
             later_exposures.get(v, Exposure()).after(first)
@@ -321,8 +320,7 @@ class StreamLoop:
         observation = task[1].result()
         ordered = enumerate(in_order(self.setup.cameras, images, self.state.frame))
         present = {v: as_array(image) for v, image in ordered if image is not None}
-        same_views = present.keys() == observation.recorded.keys()
-        same_images = same_views and all(
+        same_images = present.keys() == observation.recorded.keys() and all(
             np.array_equal(image, observation.recorded[v]) for v, image in present.items()
         )
         return observation if same_images else None

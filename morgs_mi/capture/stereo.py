@@ -234,8 +234,7 @@ def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
                 visible, pixels, _ = seen_points(view.camera, part[:, :3])
                 columns, rows = pixels.astype(int).T
                 errors = np.abs(view.blurred[rows, columns] / 255.0 - part[visible, 3:])
-                is_valid = view.valid[rows, columns] > 0
-                good[visible] |= is_valid & (errors.max(axis=1) < _MAX_COLOR)
+                good[visible] |= (view.valid[rows, columns] > 0) & (errors.max(axis=1) < _MAX_COLOR)
             confirmed = np.concatenate([confirmed, part[good]])
     return confirmed[:_POINTS]
 

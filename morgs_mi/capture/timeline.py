@@ -283,7 +283,6 @@ def _clocks(
     """Return the clocks of the clips by their offsets and their frame rates."""
     clip_fps = [fps or reader.fps for reader in readers]
     lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
-    rates = np.array([(rate or lowest) / lowest for rate in clip_fps])
     offsets = np.array([config.offset.get(name, 0) for name in names], float)
     for c, reader in enumerate(readers):
         if reader.positions is not None:
@@ -291,7 +290,7 @@ def _clocks(
             index = round(float(offsets[c]))
             nearest = min(max(index, 0), len(reader.positions) - 1)
             offsets[c] = round(reader.positions[nearest]) + index - nearest
-    return _Clocks(offsets, rates, lowest)
+    return _Clocks(offsets, np.array([(rate or lowest) / lowest for rate in clip_fps]), lowest)
 
 
 def _without_drift(

@@ -138,8 +138,7 @@ def begin_command() -> None:
     next file that is opened would take its place, and receive what libraries print.
     """
     program = next(iter(sys.argv), "")
-    is_module = program == "-m" and "morgs_mi" in sys.orig_argv
-    if Path(program).stem != "morgs-mi" and not is_module:
+    if Path(program).stem != "morgs-mi" and not (program == "-m" and "morgs_mi" in sys.orig_argv):
         return
     for stream in ("stdin", "stdout", "stderr"):
         if getattr(sys, stream) is None:

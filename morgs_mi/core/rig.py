@@ -100,9 +100,8 @@ def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
     in front.
     """
     focus = np.append(focus_point(cameras), 1)
-    least = 1e-3 * scene_extent(cameras)
     depths = np.array([camera.world_to_camera[2] @ focus for camera in cameras])
-    return np.where(depths > least, depths, np.inf)
+    return np.where(depths > 1e-3 * scene_extent(cameras), depths, np.inf)
 
 
 def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -245,8 +244,7 @@ def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndar
 
 def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
     """Return the angle between two cameras as seen from each point, degrees."""
-    rays = [camera.position - points for camera in (a, b)]
-    x, y = map(unit_vectors, rays)
+    x, y = map(unit_vectors, [camera.position - points for camera in (a, b)])
     return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
 
 

@@ -65,11 +65,10 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
             row = rows[i]
             with errors_at(f"{file}: entry {i}: expected a camera, got a broken one"):
                 R, position = (np.asarray(row[key], float) for key in ("rotation", "position"))
-                viewmat = pose_at(R.T, position)
                 width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
                 K = intrinsic_matrix(fx, fy, width / 2, height / 2)
                 name = str(row.get("img_name", i))
-                cameras.append(Camera(K, viewmat, round(width), round(height), name))
+                cameras.append(Camera(K, pose_at(R.T, position), round(width), round(height), name))
         return file, tuple(cameras)
     return None, ()
 

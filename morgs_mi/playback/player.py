@@ -66,9 +66,8 @@ def has_confidence(stream: FrameSource) -> bool:
     Raises:
         ValueError: the header's metadata or the first packet is broken.
     """
-    learns_confidence = metadata_entry(stream, "config.motion.learn_confidence", True, bool)
     first_frames = islice(play(stream), 1)
-    return learns_confidence and any(
+    return metadata_entry(stream, "config.motion.learn_confidence", True, bool) and any(
         gaussians.logit_confidence is not None for _, gaussians in first_frames
     )
 

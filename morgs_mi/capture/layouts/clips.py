@@ -222,8 +222,7 @@ def clip_of_image(folder: Path, image: str, clips: Mapping[str, Clip]) -> Clip |
     """
     file = folder / image.replace("\\", "/")
     if not file.is_file() and file.parent.is_dir():  # a name without the suffix
-        files = {other.stem: other for other in images_in(file.parent)}
-        file = files.get(file.name, file)
+        file = {other.stem: other for other in images_in(file.parent)}.get(file.name, file)
     if file.is_file():
         return file
     name = view_of_image(clips, image, by_folder=True)

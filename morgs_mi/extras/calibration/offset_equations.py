@@ -88,10 +88,9 @@ class OffsetEquations:
         inverse = self._inverse(_FLOOR)
         blindness = np.eye(len(inverse)) - inverse @ self.matrix
         noise = inverse - inverse[reference]
-        lost_part = blindness - blindness[reference]
         return np.sqrt(
             np.einsum("vi,ij,vj->v", noise, self.scatter, noise)
-            + UNKNOWN**2 * (lost_part**2).sum(axis=1)
+            + UNKNOWN**2 * ((blindness - blindness[reference]) ** 2).sum(axis=1)
         )
 
     def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:

@@ -297,10 +297,9 @@ class _Problem:
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
         """Return the problem of a short fit with changed cameras."""
-        points = _moved(self.capture.points, self.cameras, changes)
         return FirstFrameProblem.of(
             _changed(self.views, changes),
-            (points, self.capture.point_colors),
+            (_moved(self.capture.points, self.cameras, changes), self.capture.point_colors),
             _short(self.config),
             self.render,
             rng_of(self.seed, Stream.REFINED_POINTS),

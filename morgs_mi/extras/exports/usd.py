@@ -253,8 +253,7 @@ class _Field:
         extent = np.zeros((2, 3), np.float32)
         if len(gaussians):
             means = gaussians.numpy()["means"]
-            variances = np.diagonal(covariances(gaussians), axis1=1, axis2=2)
-            reach = _EXTENT_SIGMAS * np.sqrt(variances)
+            reach = _EXTENT_SIGMAS * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
             extent[:] = (means - reach).min(axis=0), (means + reach).max(axis=0)
         values = {**self._state, "extent": extent}
         return sum(self._samples[name].put(state.frame, value) for name, value in values.items())
@@ -306,12 +305,11 @@ def _pxr() -> Any:
         raise ValueError(
             f"write_usd(): expected the package usd-core, found none; {_INSTALL}."
         ) from error
-    version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
     require(
         hasattr(modules.UsdVol, "ParticleField3DGaussianSplat"),
         "write_usd()",
         "expected OpenUSD 26.3 or newer",
-        version,
+        ".".join(map(str, modules.Usd.GetVersion()[1:])),
         _INSTALL,
     )
     return modules

@@ -174,12 +174,11 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         raise ValueError(
             f"{first[None]}: expected one folder, or {kinds}, got another; convert it."
         )
-    names = " and ".join(path.name for path in first.values())
     require(
         len(first) == 1,
         place,
         "expected frames of one format",
-        names,
+        " and ".join(path.name for path in first.values()),
         "name the files of one of them",
     )
     return paths
@@ -192,9 +191,8 @@ def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
     old, new = _scaled_features(before, now)
-    distances = np.square(new - old).sum(axis=1)
     distances_to_next = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
-    return bool(np.mean(distances <= distances_to_next) >= _LEAST_SHARE)
+    return bool(np.mean(np.square(new - old).sum(axis=1) <= distances_to_next) >= _LEAST_SHARE)
 
 
 def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:

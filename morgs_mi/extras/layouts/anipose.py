@@ -156,8 +156,7 @@ def _calibration_files(path: Path) -> list[Path]:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    files = _calibration_files(path)
-    return only_calibration(path, files, "one calibration in TOML", read_anipose)
+    return only_calibration(path, _calibration_files(path), "one calibration in TOML", read_anipose)
 
 
 READER = Reader(

@@ -408,8 +408,7 @@ class _Receivers:
         normals = np.where(is_back[:, None], -normals, normals)
         self.centers = dr.unravel(mi.Point3f, from_numpy(mi.Float, means))
         self.normals = dr.unravel(mi.Vector3f, from_numpy(mi.Float, normals))
-        flat = 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
-        self.flat = from_numpy(mi.Float, flat)
+        self.flat = from_numpy(mi.Float, 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30))
 
     def response(self, direction: Any) -> Float:
         """Return the received fraction of light from a direction."""

@@ -82,9 +82,8 @@ def light_probe(
     fov = np.rad2deg(2 * np.arctan(width / size))
     color = np.zeros((*directions.shape[:2], 3), np.float32)
     for k, sign in product(range(3), (1, -1)):
-        forward = sign * np.eye(3)[k]
         up = np.eye(3)[2 if k == 1 else 1]
-        camera = Camera.look_at(center, center + forward, up, fov, width, width)
+        camera = Camera.look_at(center, center + sign * np.eye(3)[k], up, fov, width, width)
         camera = replace(camera, near=near)
         image = np.asarray(rasterize(gaussians, camera, ("color",), background).color)
         on_face = ((axis == k) & (sign * largest > 0))[..., None]

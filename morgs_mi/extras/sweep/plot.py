@@ -98,7 +98,6 @@ def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
     heights = (np.array([end[0] for end in ends]) - low) / (high - low) - shifts
     heights = np.maximum.accumulate(np.minimum(heights, 1 - shifts[-1])) + shifts
     for height, (y, x, name, color) in zip(heights, ends, strict=True):
-        line = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
         place = (1.03, height)
         axes.annotate(
             shorten(name, 24),
@@ -106,7 +105,7 @@ def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
             place,
             "data",
             "axes fraction",
-            line,
+            {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)},
             color=color,
             va="center",
         )

@@ -333,11 +333,10 @@ def fit_arms(
             curve = scores_of(first, replace(first_config, seed=seed), None, fit_first)
             first_frames.append(curve)
             for k, (name, config, shares_first) in enumerate(arms):
-                stage = fits.part(seed * len(arms) + k, total)
                 label = f"{name}-epochs{config.fit.epochs}-seed{seed}"
                 folder = out / label.replace(", ", "+").replace(" ", "-")
                 start = first if shares_first else None
-                fit = partial(_fit_later, capture, start, stage)
+                fit = partial(_fit_later, capture, start, fits.part(seed * len(arms) + k, total))
                 scores[k, seed] = scores_of(folder, replace(config, seed=seed), curve, fit)
         fits(total, total)
     names, configs, _ = zip(*arms, strict=True)

@@ -259,9 +259,8 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
         "give it lights, e.g. `lights()` of morgs_mi.extras.synth.textures",
     )
     for camera in cameras:
-        sees_objects = (tracer.surface_points(camera).ids >= 0).any()
         require(
-            sees_objects,
+            (tracer.surface_points(camera).ids >= 0).any(),
             where,
             f"{camera.name} must see an object at 0 s",
             "none",

@@ -22,8 +22,7 @@ def fractal(rng: np.random.Generator, size: int, finest: float) -> np.ndarray:
     """Return periodic 1/f noise [size, size] of unit variance, at most `finest` cycles across."""
     white = np.fft.rfft2(rng.standard_normal((size, size)))
     frequency = np.hypot(np.fft.fftfreq(size, 1 / size)[:, None], np.fft.rfftfreq(size, 1 / size))
-    is_inside = (frequency >= 1) & (frequency <= finest)
-    amplitude = np.where(is_inside, 1 / np.maximum(frequency, 1), 0)
+    amplitude = np.where((frequency >= 1) & (frequency <= finest), 1 / np.maximum(frequency, 1), 0)
     noise = np.fft.irfft2(white * amplitude, s=(size, size))
     return noise / noise.std()
 
