@@ -115,7 +115,6 @@ def step(
         packet, fitted = _fit_later_frame(setup, state, observation, frame_progress)
     coded = decode(state.coded, packet)
     present = observation.history.images
-    missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
     problems = image_status([c.name for c in setup.cameras], state.history.images, present)
     if state.coded is None:
         for problem in problems:
@@ -125,7 +124,9 @@ def step(
         fitted,
         seconds=time.perf_counter() - start_time,
         status="; ".join([*([] if fitted.status == "ok" else [fitted.status]), *problems]) or "ok",
-        missing_views=tuple(missing),
+        missing_views=tuple(
+            camera.name for v, camera in enumerate(setup.cameras) if v not in present
+        ),
         exposures=tuple(
             later_exposures.get(v, Exposure()).after(first)
             for v, first in enumerate(fitted.exposures)
@@ -240,10 +241,13 @@ class StreamLoop:
             config: settings.
         """
         views = capture.train_views
-        cameras = [capture.cameras[v] for v in views]
-        masks = [capture.masks[v] for v in views]
         loop = cls(
-            cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure
+            [capture.cameras[v] for v in views],
+            capture.points,
+            capture.point_colors,
+            config,
+            [capture.masks[v] for v in views],
+            capture.display_exposure,
         )
         loop._can_mistake_order = False
         return loop

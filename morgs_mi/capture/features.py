@@ -241,9 +241,12 @@ def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Trac
     distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
     members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
     _, track = np.unique(track[members], return_inverse=True)
-    pixels = np.concatenate([f.points for f in features])[members]
-    colors = np.concatenate([f.colors for f in features])[members]
-    return Tracks(track, views[members], pixels, colors)
+    return Tracks(
+        track,
+        views[members],
+        np.concatenate([f.points for f in features])[members],
+        np.concatenate([f.colors for f in features])[members],
+    )
 
 
 def intersect(

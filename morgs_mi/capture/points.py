@@ -72,8 +72,11 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     partners = Counter(view for pair in matched_pairs for view in pair)
     few = {view for view in capture.train_views if partners[view] < _MIN_PARTNERS}
     pairs = combinations(capture.train_views, 2)
-    unmatched = [pair for pair in pairs if pair not in matched_pairs and few & set(pair)]
-    matches += match_guided(shared.features, cameras, unmatched)
+    matches += match_guided(
+        shared.features,
+        cameras,
+        [pair for pair in pairs if pair not in matched_pairs and few & set(pair)],
+    )
     points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
     return replace(capture, points=points, point_colors=colors)
 

@@ -94,11 +94,13 @@ def load_tracks(folder: str | Path) -> Tracks:
     path = existing_file(
         Path(folder) / "tracks.npz", "the tracks of a synthetic capture", "pass its truth folder"
     )
-    points = read_array(path, "points")
-    ids = read_array(path, "ids")
     prefix = "visible_"
     names = [name.removeprefix(prefix) for name in array_names(path) if name.startswith(prefix)]
-    return Tracks(points, ids, {name: read_array(path, prefix + name) for name in names})
+    return Tracks(
+        read_array(path, "points"),
+        read_array(path, "ids"),
+        {name: read_array(path, prefix + name) for name in names},
+    )
 
 
 def save_tracks(folder: str | Path, tracks: Tracks) -> None:

@@ -115,10 +115,12 @@ class Flight(ExportKind):
         path = path if self.seconds is None else path.with_duration(self.seconds)
         count = num_images(stream, path)
         frames = repeated_frames(stream, self.freeze, self.back_and_forth)
-        images = flight(stream, path, self.channels, frames)
-        stops = shown_exposure(stream, self.display_exposure)
         write_images(
-            images, stream.fps, output, lambda done: report("Rendering", done, count), stops
+            flight(stream, path, self.channels, frames),
+            stream.fps,
+            output,
+            lambda done: report("Rendering", done, count),
+            shown_exposure(stream, self.display_exposure),
         )
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
 

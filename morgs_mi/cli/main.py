@@ -134,8 +134,9 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             return _CLOSED
         sentence = "Interrupted."
         if not is_interruption(error):
-            place = str(getattr(command, "capture", None) or "")
-            sentence = sentence_of(error, _option_names(command), place)
+            sentence = sentence_of(
+                error, _option_names(command), str(getattr(command, "capture", None) or "")
+            )
         # In the notes of an error, `--resume` is the command line that continues.
         resume = [] if "--resume" in args else ["--resume"]
         command_line = shlex.join([prog, *args, *resume])
@@ -209,8 +210,9 @@ def _set_up(options: Common) -> None:
     """Send warnings to standard error and set Mitsuba's variant."""
     import mitsuba as mi
 
-    level = logging.DEBUG if options.debug else logging.WARNING
-    logging.basicConfig(level=level, handlers=[LogHandler()])
+    logging.basicConfig(
+        level=logging.DEBUG if options.debug else logging.WARNING, handlers=[LogHandler()]
+    )
     try:
         mi.set_variant(options.variant)
     except ImportError as error:

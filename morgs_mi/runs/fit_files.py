@@ -220,10 +220,12 @@ class Recording:
         """Add frames with all their packets; see `push`."""
         self._check_in_place()
         reports = [*self.reports, *reports]
-        rows = [asdict(report) for report in reports]
         # The disk may have room for only one of the two first frames.
         self._files.provisional.unlink(missing_ok=True)
-        write_json(self._written_files.report, {**self._metadata, "frames": rows, **entries})
+        write_json(
+            self._written_files.report,
+            {**self._metadata, "frames": [asdict(report) for report in reports], **entries},
+        )
         for packet in packets:
             self._writer.write(packet)
         self.reports = reports
