@@ -16,7 +16,7 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -55,7 +55,7 @@ from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 # Exit status of a shell for a program whose reader has ended, such as `head`.
 _CLOSED = 141
 # The class of each command, in the order of the help: a dataclass of its options, with `run`.
-COMMANDS: Mapping[str, type] = {
+COMMANDS = {
     "fit": Fit,
     "render": Render,
     "export": Export,

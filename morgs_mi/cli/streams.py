@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -110,7 +110,7 @@ class ExportKind:
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self, stream: FrameSource) -> None:
-        options: Mapping[str, Any] = vars(self)
+        options = vars(self)
         stem = Path(options.get("path", "")).stem
         output, chosen = destination(stream.path, options["output"], self.formats, stem)
         with progress() as report:

@@ -33,13 +33,13 @@ import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.entropy import LIMIT
-from morgs_mi.core.attributes import ATTRIBUTES, SIGMOID, Attribute
+from morgs_mi.core.attributes import ATTRIBUTES, SIGMOID
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Arrays
 
-_STORED: dict[str, Attribute] = {row.name: row for row in ATTRIBUTES if row.error is not None}
+_STORED = {row.name: row for row in ATTRIBUTES if row.error is not None}
 _ERRORS = {row.name: row.error for row in ATTRIBUTES if row.error is not None}  # tolerated
 # Every stream has these groups, and `_exponents` has a rule for each; all others are optional.
 _ALWAYS = ("means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest")

@@ -254,7 +254,7 @@ def accuracy(
     scales[2:5] = scales[2:5].clip(0.01 * scales[2:5].max())
 
     configs = {name: replace(config, **change) for name, change in CHANGES.items()}
-    times: dict[str, list[float]] = {name: [] for name in configs}
+    times = {name: [] for name in configs}
     errors: dict[str, dict[str, float]] = {}
     stage = Progress(progress, "Measuring settings")
     # In turns, because other programs may slow down some of them; the first round compiles.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -98,7 +97,7 @@ def fit_later_frame(
     objective = config.objective
     order = [views[k] for k in view_order(count, config.epochs * count, rng)]
     # As tensors on the region of each active view.
-    observations: dict[int, dict[str, Any]] = {
+    observations = {
         v: {"target": problem.targets[v]}
         | {
             name: from_numpy(mi.TensorXf, view.crop(array))

@@ -132,7 +132,7 @@ def _cost_surfaces(
     problem: MotionProblem, parts: Sequence[np.ndarray], reach: float
 ) -> list[list[_CostSurface]]:
     """Return the cost surfaces of each of up to three parts, in the views that show it."""
-    surfaces: list[list[_CostSurface]] = [[] for _ in parts]
+    surfaces = [[] for _ in parts]
     images = problem.images_around(np.any(parts, axis=0), [])
     if images is None:
         return surfaces

@@ -81,7 +81,7 @@ DEFAULT_RIG = "default_rig"
 """Entry of a stream's metadata that is true where its cameras are made up, not recorded."""
 
 # Directions up and forward of the first camera.
-_DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
+_DIRECTIONS = {
     "y-down": (np.array([0.0, -1, 0]), np.array([0.0, 0, 1])),
     "y-up": (np.array([0.0, 1, 0]), np.array([0.0, 0, -1])),
     "z-up": (np.array([0.0, 0, 1]), np.array([0.0, 1, 0])),

@@ -237,7 +237,7 @@ def fitted_capture(stream: FrameSource) -> str:
     Raises:
         FileNotFoundError: no path is stored, or the folder is not there any more.
     """
-    documents: list[Any] = [stream.metadata]
+    documents = [stream.metadata]
     with suppress(OSError, ValueError):
         documents.append(read_json(stream.path.with_name(CAPTURE)))
     entries = [fields.get("capture") for fields in documents if isinstance(fields, dict)]

@@ -132,7 +132,7 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
-    tables: list[Any] = [mi.traverse(shape) for shape in shapes]
+    tables = [mi.traverse(shape) for shape in shapes]
     pairs = zip(shapes, tables, strict=True)
     attached = [(params, key, params[key]) for shape, params in pairs for key in _attached(shape)]
     for params, key, value in attached:

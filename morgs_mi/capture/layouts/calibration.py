@@ -209,7 +209,7 @@ def match_clips(
     parts = [PurePosixPath(camera.name.replace("\\", "/")).parts[:-1] for camera in cameras]
     folders = map(clips.get, {folder for place in parts for folder in place})
     in_folders = any(isinstance(clip, Path) and clip.is_dir() for clip in folders)
-    attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
+    attempts = (
         (lambda _: clips, True),
         (lambda _: {} if in_folders else clips, False),
         (photos, False),

@@ -8,7 +8,7 @@ image centre.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -21,7 +21,6 @@ from morgs_mi.core.bounded import read_array
 from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at, rigid
 from morgs_mi.core.checks import errors_at
 from morgs_mi.core.files import atomic_path
-from morgs_mi.io.video import Clip
 
 
 def read_poses_bounds(
@@ -90,7 +89,7 @@ def _read_calibration(path: Path) -> Calibration:
     per frame.
     """
     source = path / "poses_bounds.npy"
-    clips: Mapping[str, Clip] = required_clips(path)
+    clips = required_clips(path)
     count = read_array(source).shape[:1]
     if (len(clips),) != count == (len(by_frame := clips_by_frame(path)),):
         check_frames(path, by_frame)

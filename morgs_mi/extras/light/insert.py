@@ -392,7 +392,7 @@ class _Receivers:
     """
 
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
-        means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
+        means = np.array(dr.detach(gaussians.means), np.float64)
         mixture = _mixture(means, np.array(dr.detach(gaussians.opacities), np.float64))
         # The covariance of the mixture: the mean of its second moments, minus the second moment of
         # its centre.

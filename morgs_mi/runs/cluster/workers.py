@@ -41,7 +41,7 @@ _LOST = (
     "a scheduler that answers, but the connection was lost; start it again",
 )
 # Errors of Dask by the names of their classes, and what they mean.
-_FAULTS: dict[str, tuple[type[Exception], str]] = {
+_FAULTS = {
     "KilledWorker": (
         ChildProcessError,
         "the workers to stay alive, but all died that ran one task, perhaps for lack of memory; "
