@@ -72,7 +72,7 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     values = {
         name: np.array(dr.detach(value)) for name, value in values.items() if value is not None
     }
-    means, scales, quats = (values.pop(name) for name in names[:3])
+    means, scales, quats = map(values.pop, names[:3])
     # Mitsuba expects unit quaternions.
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     data = np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)

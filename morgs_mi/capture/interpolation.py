@@ -33,7 +33,7 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
     """
     has_light = first.dtype != np.uint8
     if has_light:
-        first, second = (encode_light(image) for image in (first, second))
+        first, second = map(encode_light, (first, second))
     pair = [np.clip(image, 0, 1) if has_light else image for image in (second, first)]
     backward, forward = FLOW_SOURCES.make("dis")(FramePair(pair[0], pair[1]))
     first, first_weight = _contribution(first, forward, backward, share)

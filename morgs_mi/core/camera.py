@@ -184,7 +184,7 @@ class Camera:
             "splats are drawn only by pinhole cameras without lens distortion",
         )
         params: Any = mi.traverse(sensor)
-        width, height = (int(size) for size in sensor.film().size())
+        width, height = map(int, sensor.film().size())
         names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip")
         fov, *offset, near = (float(np.asarray(params[name]).item()) for name in names)
         K = intrinsics_of_fov(fov, width, height, *offset)

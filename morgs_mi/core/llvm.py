@@ -107,7 +107,7 @@ def choose_llvm(choice: str | None = None) -> tuple[Path | None, str]:
     if choice and usable(Path(choice)):
         return Path(choice), ""
     libraries = find_llvm()
-    best = next((path for path in libraries if usable(path)), None)
+    best = next(filter(usable, libraries), None)
     if choice:
         rest = f"{best} is used instead." if best else f"No other was found: {REMEDY}."
         return best, f"{VARIABLE}={choice} is not a libLLVM that Dr.Jit can use here. {rest}"

@@ -102,7 +102,7 @@ class FrameScores:
     def as_dict(self) -> dict[str, Any]:
         """Return the frame's row of the JSON."""
         row = asdict(self)
-        scores, motion, views = (row.pop(name) for name in ("scores", "motion_3d", "views"))
+        scores, motion, views = map(row.pop, ("scores", "motion_3d", "views"))
         return {**row, **scores, "motion_3d": motion or {}, "views": views}
 
 

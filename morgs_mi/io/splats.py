@@ -112,7 +112,7 @@ _RECORD = np.dtype(
 def suffix_of(path: str | Path) -> str | None:
     """Return the suffix of a file out of `SUFFIXES`, in any case of letters, or None."""
     name = Path(path).name.lower()
-    return next((suffix for suffix in SUFFIXES if name.endswith(suffix)), None)
+    return next(filter(name.endswith, SUFFIXES), None)
 
 
 def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:

@@ -135,7 +135,7 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
     half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * float(np.exp(np.median(sizes))), least)
     ring = _ring((low + high) / 2, half, axes)
-    some = thinned(next(gaussians for gaussians in frames if len(gaussians)))
+    some = thinned(next(filter(len, frames)))
     details = []  # mean differences between neighbouring pixels
     for camera in ring:
         thumbnail = camera.with_width(_THUMBNAIL)

@@ -283,7 +283,7 @@ class SurfaceView:
                 "their silhouettes and depth; do not optimise `%s` with it.",
                 "`, `".join(moving),
             )
-        if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
+        if self.splats is not None and any(map(_attached, self.gaussians)):
             _log.warning(
                 "splat_path: gradients of the Gaussians are those of the splats that the camera "
                 "sees; they lack what the Gaussians send to the surfaces and take from their "

@@ -86,7 +86,7 @@ def _read_exr(path: Path) -> np.ndarray:
     pairs = [pair for pair in _CHANNELS if set(pair) <= channels.keys()]
     # The renderer's files hold colours beside the motion: their R and G are not flow.
     if len(pairs) != 1 or "motion.X" in channels:
-        names = ", ".join("/".join(pair) for pair in _CHANNELS)
+        names = ", ".join(map("/".join, _CHANNELS))
         raise ValueError(
             f"one pair of the channels {names}, and no motion map, got "
             f"{', '.join(sorted(channels))}"
