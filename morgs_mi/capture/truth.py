@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -108,7 +109,7 @@ def save_tracks(folder: str | Path, tracks: Tracks) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    arrays = {f"visible_{name}": mask for name, mask in tracks.visible.items()}
+    arrays: dict[str, Any] = {f"visible_{name}": mask for name, mask in tracks.visible.items()}
     np.savez_compressed(Path(folder) / "tracks.npz", points=tracks.points, ids=tracks.ids, **arrays)
 
 
