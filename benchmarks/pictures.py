@@ -1,15 +1,18 @@
-"""Draw the demo as a moving picture for the README, and the stages of one frame of its clip for the
-page docs/how-it-works.md.
+"""Draw the demo as a moving picture for the README, recordings beside their fits for the page
+docs/recordings.md, and the stages of one frame of the demo's clip for docs/how-it-works.md.
 
     morgs-mi demo out/demo
+    morgs-mi synth spheres out/fair/capture --cameras 5 --frames 10
+    morgs-mi fit out/fair/capture out/fair/stream
+    morgs-mi fit walk4 out/walk4 --frames 30 --downscale 4 --hold-out cam02
     python -m benchmarks.pictures
 
-Without the demo, its clip alone is made. All stages show one key view.
+Without a fit, its picture is left as it is; the demo's clip is made. All stages show one key view.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,34 +24,47 @@ import morgs_mi
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.evaluate.comparison import ComparedClip
+from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.extras.demo.demo import DemoConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.video import VideoReader
 from morgs_mi.loop.observation import FrameObservation, observe_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.lift import lift_flow
-from morgs_mi.playback.visualise import confidence_image, grey_image, motion_image, to_uint8
+from morgs_mi.playback.player import explained_image
+from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.visualise import label, side_by_side, to_uint8
 from morgs_mi.stream_loop import StreamLoop
 
 _CAPTURE = Path("out/demo/capture")
 _VIDEO = Path("out/demo/side_by_side.mp4")
 _MOVING_PICTURE = Path("docs/demo.webp")
+# Fits by the expected quality of views between their cameras.
+_FITS = {
+    "good": Path("out/demo/stream"),
+    "fair": Path("out/fair/stream"),
+    "poor": Path("out/walk4"),
+}
+_CLIPS = Path("docs/recordings")
 _QUALITY = 80
+# Shortest duration of a clip in seconds; a shorter one is played more slowly.
+_LEAST_SECONDS = 3
 _OUT = Path("docs/how-it-works")
 _FRAME = 5  # a multiple of `mask_interval`, at which motion masks are computed
-_ERROR_GAIN = 10
 _JPEG_QUALITY = 90
 
 
 def main() -> None:
-    """Write the moving picture, fit the clip up to the frame, and write a JPEG file per stage."""
+    """Write the moving pictures, fit the clip up to the frame, and write a JPEG file per stage."""
     mi.set_variant("llvm_ad_rgb")
     if _VIDEO.exists():
         video = VideoReader.open(_VIDEO)
-        animation = cv2.Animation()
-        animation.frames = [frame[..., ::-1].copy() for frame in video.frames()]
-        animation.durations = [round(1e3 / (video.fps or 1))] * video.num_frames
-        cv2.imwriteanimation(str(_MOVING_PICTURE), animation, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+        write_animation(_MOVING_PICTURE, video.frames(), video.fps or 1)
+    for quality, fit in _FITS.items():
+        if fit.exists():
+            clip = ComparedClip.of(open_stream(fit), None)
+            write_animation(_CLIPS / f"{quality}.webp", compared(clip), clip.stream.fps)
     config = DemoConfig()
     if not _CAPTURE.exists():
         synthesize(config.scene, _CAPTURE, replace(config.clip, seed=config.stream.seed))
@@ -63,6 +79,25 @@ def main() -> None:
     for name, picture in draw(loop, frames[-1]).items():
         bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
         cv2.imwrite(str(_OUT / f"{name}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+
+
+def write_animation(path: Path, images: Iterable[np.ndarray], fps: float) -> None:
+    """Write images [H, W, 3] as an animated WebP file, at `fps` or more slowly."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    animation = cv2.Animation()
+    animation.frames = [image[..., ::-1].copy() for image in images]
+    count = len(animation.frames)
+    animation.durations = [round(1e3 * max(1 / fps, _LEAST_SECONDS / count))] * count
+    cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+
+
+def compared(clip: ComparedClip) -> Iterable[np.ndarray]:
+    """Yield the first held-out view of a fit, recorded and rendered side by side."""
+    for frame in clip.frames():
+        view = next(iter(frame.views()))
+        score = psnr(view.rendered, view.recorded, view.valid)
+        images = (label(view.recorded, "recorded"), label(view.rendered, f"{score:.1f} dB"))
+        yield side_by_side(images)
 
 
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
@@ -90,17 +125,20 @@ def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.
     picture = _channel(new_gaussians, camera, "color")
     # Fully saturated at a speed that the fastest pixels reach.
     scale = float(np.percentile(np.linalg.norm(flow.motion[flow.mask], axis=-1), 95))
+    flow_image = np.where(flow.reliable[..., None], flow.motion, np.nan)
+    lifted_motion = _channel(lifted_gaussians, camera, "motion")
+    share = _changed_share(state.coded, state_after, camera)
     return {
         "image": image,
-        "changes": grey_image(changes[view].astype(float)),
-        "flow": motion_image(np.where(flow.reliable[..., None], flow.motion, np.nan), scale),
-        "mask": grey_image(flow.mask.astype(float)),
-        "lifted": motion_image(_channel(lifted_gaussians, camera, "motion"), scale),
-        "motion": motion_image(_channel(new_gaussians, camera, "motion"), scale),
-        "confidence": confidence_image(_channel(new_gaussians, camera, "confidence")),
-        "residual": confidence_image(_changed_share(state.coded, state_after, camera)),
+        "changes": to_uint8(changes[view].astype(float)),
+        "flow": explained_image("motion", flow_image, scale, "flow"),
+        "mask": to_uint8(flow.mask.astype(float)),
+        "lifted": explained_image("motion", lifted_motion, scale, "lifted flow"),
+        "motion": explained_image("motion", _channel(new_gaussians, camera, "motion"), scale),
+        "confidence": explained_image("confidence", _channel(new_gaussians, camera, "confidence")),
+        "residual": explained_image("confidence", share, title="share"),
         "render": to_uint8(np.clip(picture, 0, 1)),
-        "error": to_uint8(np.clip(_ERROR_GAIN * np.abs(picture - image / 255), 0, 1)),
+        "error": explained_image("error", np.abs(picture - image / 255)),
     }
 
 

@@ -7,7 +7,6 @@ import re
 import shlex
 import shutil
 import sys
-import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -80,22 +79,18 @@ def quantity(count: int, noun: str) -> str:
     return f"{count} {noun if count == 1 else noun + 's'}"
 
 
-def print_result(text: str) -> None:
-    """Print to standard output; on a terminal, lines are wrapped between words.
+def print_result(text: str, styles: Mapping[str, str] | None = None) -> None:
+    """Print to standard output; on a terminal, lines are wrapped between words, and words have the
+    styles of Rich that `styles` names.
 
     Raises:
         OSError: it is full or closed; the error names it.
     """
-    lines = printable(text).split("\n")
-    if sys.stdout.isatty():
-        width = shutil.get_terminal_size().columns
-        wrapped = [
-            textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False) or [""]
-            for line in lines
-        ]
-        lines = [line for part in wrapped for line in part]
+    content = Text(printable(text))
+    for word, style in (styles or {}).items():
+        content.highlight_words([word], style)
     with naming_output():
-        print("\n".join(lines))
+        OUT.print(content, soft_wrap=not sys.stdout.isatty(), overflow="ignore", crop=False)
 
 
 def print_next(*words: object) -> None:

@@ -20,10 +20,14 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Arrays
 from morgs_mi.playback.stream_header import metadata_entry, render_config, stream_exposure
 from morgs_mi.playback.visualise import (
+    LARGEST_ERROR,
     confidence_image,
     depth_image,
-    grey_image,
+    depth_limits,
+    error_image,
+    label,
     motion_image,
+    motion_legend,
     to_uint8,
 )
 from morgs_mi.render.channels import attribute_channels
@@ -76,15 +80,51 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     """Return the visualisation of a rendered channel, uint8 RGB [H, W, 3].
 
     Args:
-        name: of the channel.
+        name: of the channel, or `error` for the absolute difference of two images.
         image: values of the channel [H, W, C].
         motion_scale: speed of full saturation in pixels. The default is `MOTION_SCALE`, which is
             the same for all frames of a clip.
     """
     if name == "motion":
         return motion_image(image, motion_scale or MOTION_SCALE * image.shape[1])
-    draw = {"color": to_uint8, "confidence": confidence_image, "depth": depth_image}
-    return draw.get(name, grey_image)(image)
+    draw = {
+        "color": to_uint8,
+        "confidence": confidence_image,
+        "depth": depth_image,
+        "error": error_image,
+    }
+    return draw[name](image) if name in draw else to_uint8(image.mean(axis=-1))
+
+
+def explained_image(
+    name: str, image: np.ndarray, motion_scale: float | None = None, title: str | None = None
+) -> np.ndarray:
+    """Return the `channel_image` of a channel with its legend: a label with the values of the first
+    and the last colour, and the wheel of motion in the lower right corner or a bar of the colours
+    along the lower edge. Colour, alpha and others have none.
+
+    Args:
+        name: of the channel.
+        image: values of the channel [H, W, C].
+        motion_scale: as for `channel_image`.
+        title: start of the label; None: the name.
+    """
+    H, W = image.shape[:2]
+    motion_scale = motion_scale or MOTION_SCALE * W
+    picture = channel_image(name, image, motion_scale)
+    limits = {"motion": (0, motion_scale), "confidence": (0, 1), "error": (0, LARGEST_ERROR)}
+    if name not in (*limits, "depth"):
+        return picture
+    least, largest = limits.get(name) or depth_limits(image)
+    text = f"{title or name}, {least:.3g} to {largest:.3g}"
+    if name == "motion":
+        size = H // 5 + 1
+        picture[-size:, -size:] = motion_legend(motion_scale, size)
+        text += " px"
+    else:
+        ramp = np.linspace(least, largest, W)[None, :, None]
+        picture[-(H // 30 + 1) :] = channel_image(name, ramp)
+    return label(picture, text)
 
 
 def playback_speed(stream: FrameSource, camera: Camera, config: RenderConfig) -> dict[str, float]:

@@ -1,5 +1,5 @@
-"""Visualisation: images of motion, confidence and depth, legends, labels, contact sheets, PNG
-files.
+"""Visualisation: images of motion, confidence, depth and errors, legends, labels, contact sheets,
+PNG files.
 
 All images that are returned are uint8 RGB [H, W, 3].
 """
@@ -22,6 +22,8 @@ BACKGROUND = 255
 """Grey level of that space."""
 UNDEFINED = (128, 128, 128)
 """Colour of pixels with a value that is not finite, or a depth that is not positive."""
+LARGEST_ERROR = 0.1
+"""Error of the brightest colour of `error_image`, as a share of white."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -42,11 +44,6 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         )
     levels = byte_values(np.nan_to_num(image, posinf=0, neginf=0))
     return np.broadcast_to(levels, (*image.shape[:2], 3)).copy()
-
-
-def grey_image(values: np.ndarray) -> np.ndarray:
-    """Return values [H, W] or [H, W, C] in [0, 1] as grey levels, the mean of the C components."""
-    return to_uint8(values if values.ndim == 2 else values.mean(axis=-1))
 
 
 def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
@@ -80,14 +77,14 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     return image
 
 
-def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `motion_image`: a disc of its colours with the speed at
-    the rim.
+def motion_legend(scale_px: float, size: int) -> np.ndarray:
+    """Return the legend [size, size, 3] of `motion_image`: a disc of its colours, with the speed
+    `scale_px` at the rim.
     """
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
-    return label(motion_image(motion, scale_px), f"{scale_px:.3g} px")
+    return motion_image(motion, scale_px)
 
 
 def confidence_image(confidence: np.ndarray) -> np.ndarray:
@@ -97,21 +94,32 @@ def confidence_image(confidence: np.ndarray) -> np.ndarray:
     return _apply_colour_map(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
 
 
+def error_image(error: np.ndarray) -> np.ndarray:
+    """Return absolute differences [H, W, C] of images in [0, 1] as colours, by the mean of the C
+    components: black is none, bright yellow is `LARGEST_ERROR` and more.
+    """
+    return _apply_colour_map(error.mean(axis=-1) / LARGEST_ERROR, cv2.COLORMAP_MAGMA)
+
+
+def depth_limits(depth: np.ndarray) -> np.ndarray:
+    """Return the 1st and 99th percentile of the depths that are positive and finite; 1 and 1
+    without any.
+    """
+    depths = depth[np.isfinite(depth) & (depth > 0)]
+    return np.percentile(depths, (1, 99)) if depths.size else np.ones(2)
+
+
 def depth_image(depth: np.ndarray) -> np.ndarray:
-    """Return depth [H, W] or [H, W, 1] in world units as colours, linear in 1 / depth: red is the
-    1st percentile and nearer, blue the 99th and farther.
+    """Return depth [H, W] or [H, W, 1] in world units as colours, linear in 1 / depth: bright
+    yellow is the first of `depth_limits` and nearer, dark violet the second and farther.
 
     Values that are not positive and finite are grey.
     """
     depth = np.asarray(depth, np.float64).reshape(np.shape(depth)[:2])
     valid = np.isfinite(depth) & (depth > 0)
-    if not valid.any():
-        return np.full((*depth.shape, 3), UNDEFINED, np.uint8)
-    near, far = np.percentile(depth[valid], (1, 99))
-    # 1 at the depth `near` and 0 at `far`.
-    span = max(1 / near - 1 / far, 1e-12)
-    nearness = (1 / np.where(valid, depth, far) - 1 / far) / span
-    image = _apply_colour_map(nearness, cv2.COLORMAP_TURBO)
+    near, far = depth_limits(depth)
+    nearness = np.interp(1 / np.where(valid, depth, far), (1 / far, 1 / near), (0, 1))
+    image = _apply_colour_map(nearness, cv2.COLORMAP_VIRIDIS)
     image[~valid] = UNDEFINED
     return image
 

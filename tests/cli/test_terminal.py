@@ -22,7 +22,7 @@ NAMES = [(), *((name,) for name in COMMANDS), *(("export", name) for name in EXP
 
 
 def on_terminal(columns: int, *args: str | Path) -> str:
-    """Return what a command prints on a terminal, without its colours."""
+    """Return what a command prints on a terminal, with its colours."""
     parent, child = pty.openpty()
     fcntl.ioctl(child, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
     environment = {k: v for k, v in os.environ.items() if k != "COLUMNS"} | {"TERM": "xterm"}
@@ -39,7 +39,7 @@ def on_terminal(columns: int, *args: str | Path) -> str:
                 break
             output += part
     os.close(parent)
-    return re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", output.decode()).replace("\r", "\n")
+    return output.decode().replace("\r", "\n")
 
 
 @pytest.mark.parametrize("columns", [80, 100])
@@ -67,7 +67,10 @@ def test_commands__print_whole_words_on_a_terminal(columns, fitted_clip, tmp_pat
         ("render", fitted_clip, tmp_path / "long-name-of-a-folder-of-images-png", "--camera", "0"),
         ("fit", fitted_clip / "missing", tmp_path / "out"),
     ):
-        text = on_terminal(columns, *args)
+        colored_text = on_terminal(columns, *args)
+        verdict = r"Views between the cameras will be \x1b\[1;3[123]m(good|fair|poor)\x1b\[0m:"
+        assert (args[0] == "info") == bool(re.search(verdict, colored_text))
+        text = re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", colored_text)
         assert text.strip()
         # Only a path that is longer than the terminal is broken.
         lines = [line for line in text.splitlines() if " " in line.strip()]

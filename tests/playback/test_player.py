@@ -14,7 +14,9 @@ from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.playback.player import (
+    MOTION_SCALE,
     channel_image,
+    explained_image,
     has_confidence,
     playback_speed,
     render_stream,
@@ -153,6 +155,29 @@ def test_channel_image__draws_other_channels_as_grey_values():
     image = channel_image("wetness", ramp)
     assert (image == image[..., :1]).all()
     assert_array_equal(image, channel_image("alpha", ramp))
+
+
+@pytest.mark.parametrize("name", ["confidence", "error", "depth"])
+def test_explained_image__has_a_bar_of_the_colours_along_the_lower_edge(name):
+    largest = 0.1 if name == "error" else 1
+    values = np.full((60, 200, 1), largest, np.float32)
+    values[:, :100] = largest / 2 if name == "depth" else 0
+    image = explained_image(name, values)
+    assert_array_equal(image[30], channel_image(name, values)[30])
+    assert_array_equal(image[-1, [0, -1]], image[30, [0, -1]])
+    assert len(np.unique(image[-1], axis=0)) > 90
+    assert not np.array_equal(image[:10], explained_image(name, values, title="other")[:10])
+
+
+def test_explained_image__has_the_wheel_of_motion_in_a_corner():
+    still = np.zeros((100, 200, 2))
+    image = explained_image("motion", still)
+    size = 21
+    assert (image[-size:, :-size] == 255).all()
+    right = channel_image("motion", still + np.array([MOTION_SCALE * 200 * 0.9, 0]))[0, 0]
+    assert np.abs(image[-size // 2, -2] - right.astype(int)).max() < 30
+    color = np.random.default_rng(0).uniform(size=(9, 9, 3))
+    assert_array_equal(explained_image("color", color), channel_image("color", color))
 
 
 @pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])

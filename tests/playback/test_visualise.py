@@ -26,17 +26,24 @@ def test_motion_legend__agrees_with_the_image():
     assert (legend[-1, -1] == 255).all()
 
 
+def test_error_image__is_black_without_an_error_and_one_sided():
+    error = np.array([0, 0.02, 0.05, 0.1, 0.5])[None, :, None] * np.array([0.5, 1, 1.5])
+    brightness = visualise.error_image(error).sum(-1, dtype=int)[0]
+    assert brightness[0] < 10
+    assert (np.diff(brightness[:4]) > 0).all()
+    assert brightness[3] == brightness[4]
+
+
 def test_confidence_image__brightens_with_confidence():
     ramp = visualise.confidence_image(np.linspace(0, 1, 8)[None, :, None])
     assert (np.diff(ramp.sum(-1, dtype=int)[0]) > 0).all()
 
 
-def test_depth_image__near_is_red_far_is_blue_undefined_is_grey():
+def test_depth_image__brightens_with_nearness_and_undefined_is_grey():
     depth = np.array([[1.0, 2.0, 10.0, 0.0, np.inf, np.nan]])
-    red, _, blue, *undefined = visualise.depth_image(depth)[0].astype(int)
-    assert red[0] > red[2]
-    assert blue[2] > blue[0]
-    assert (np.array(undefined) == 128).all()
+    image = visualise.depth_image(depth)[0].astype(int)
+    assert (np.diff(image[:3].sum(-1)) < 0).all()
+    assert (image[3:] == 128).all()
     assert (visualise.depth_image(np.zeros((2, 2))) == 128).all()
     assert np.unique(visualise.depth_image(np.ones((2, 2, 1)))[..., 0]).size == 1
 

@@ -20,6 +20,7 @@ from morgs_mi.core.files import REPORT, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report, Steps
 from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.results import ViewScores
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import stored_settings, synthesize
@@ -27,10 +28,10 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
-from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.player import explained_image, render_stream
 from morgs_mi.playback.stream_header import truth_for_camera
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
+from morgs_mi.playback.visualise import contact_sheet, label, side_by_side, to_uint8, write_png
 from morgs_mi.runs.fit_capture import begin_as, stream_capture
 from morgs_mi.runs.fit_files import stream_metadata
 
@@ -42,8 +43,6 @@ _COMPARED = (
     "motion_error_still",
     "true_motion_moving",
 )
-# Factor on the error images: errors of a tenth are visible, typical ones are smaller.
-_ERROR_GAIN = 4
 # Shortest duration of the video in seconds; a short clip is played more slowly.
 _LEAST_SECONDS = 3
 
@@ -192,7 +191,7 @@ def _draw(out: Path, capture: Capture, report: Steps) -> None:
     frames = sorted({min(1, len(full) - 1), last, len(full) - 1})
     plain_panels = [panel for name, panel in plain[last].items() if name != "confidence"]
     sheet = [list(full[frame].values()) for frame in frames]
-    sheet.append([*plain_panels, motion_legend(scale)])
+    sheet.append(plain_panels)
     write_png(out / "contact_sheet.png", contact_sheet(sheet))
     report(2, 2)
 
@@ -208,25 +207,18 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
     for frame, (index, images) in zip(
         capture.frames(), render_stream(reader, camera), strict=False
     ):
-        picture = channel_image("color", images["color"])
-        error = np.abs(picture.astype(float) - frame.images[view]) * _ERROR_GAIN / 255
+        picture = to_uint8(images["color"])
+        truth_image = frame.images[view]
         panels = {
-            "truth": frame.images[view],
-            "render": picture,
-            "error": channel_image("color", error),
+            "truth": label(truth_image, f"truth, frame {index}"),
+            "render": label(picture, f"render{note}, {psnr(picture, truth_image):.2f} dB"),
+            "error": explained_image("error", abs(picture / 255 - truth_image / 255)),
         }
         truth = truth_for_camera(capture, camera, index)
         if truth is not None:
-            panels["true motion"] = channel_image("motion", truth.motion, scale)
+            panels["true motion"] = explained_image("motion", truth.motion, scale, "true motion")
         for name in ("motion", "confidence"):
             if name in images:
-                panels[name] = channel_image(name, images[name], scale)
-        labels = {
-            "truth": f"truth, frame {index}",
-            "error": f"error x{_ERROR_GAIN}",
-            "true motion": "true motion",
-        }
-        frames.append(
-            {name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()}
-        )
+                panels[name] = explained_image(name, images[name], scale, name + note)
+        frames.append(panels)
     return frames

@@ -14,7 +14,7 @@ from morgs_mi.core.types import Arrays
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
-from morgs_mi.playback.player import channel_image
+from morgs_mi.playback.player import explained_image
 from morgs_mi.playback.visualise import side_by_side, to_uint8, write_png
 from morgs_mi.render.channels import exr_names
 
@@ -120,4 +120,4 @@ def pad_to_even(image: np.ndarray) -> np.ndarray:
 
 
 def _combined_image(images: Arrays) -> np.ndarray:
-    return side_by_side([channel_image(name, image) for name, image in images.items()])
+    return side_by_side([explained_image(name, image) for name, image in images.items()])
