@@ -2,9 +2,10 @@
 docs/recordings.md, and the stages of one frame of the demo's clip for docs/how-it-works.md.
 
     morgs-mi demo out/demo
-    morgs-mi synth spheres out/fair/capture --cameras 5 --frames 10
-    morgs-mi fit out/fair/capture out/fair/stream
-    morgs-mi fit walk4 out/walk4 --frames 30 --downscale 4 --hold-out cam02
+    morgs-mi fit out/demo/capture out/fair --exclude cam01 cam02 cam03 cam04 cam06 \
+        --num-gaussians 20000 --first-frame-steps 750
+    morgs-mi fit walk4 out/walk4 --frames 20 --downscale 4 --hold-out cam02 \
+        --num-gaussians 10000 --first-frame-steps 900
     python -m benchmarks.pictures
 
 Without a fit, its picture is left as it is; the demo's clip is made. All stages show one key view.
@@ -43,7 +44,7 @@ _MOVING_PICTURE = Path("docs/demo.webp")
 # Fits by the expected quality of views between their cameras.
 _FITS = {
     "good": Path("out/demo/stream"),
-    "fair": Path("out/fair/stream"),
+    "fair": Path("out/fair"),
     "poor": Path("out/walk4"),
 }
 _CLIPS = Path("docs/recordings")
@@ -92,12 +93,17 @@ def write_animation(path: Path, images: Iterable[np.ndarray], fps: float) -> Non
 
 
 def compared(clip: ComparedClip) -> Iterable[np.ndarray]:
-    """Yield the first held-out view of a fit, recorded and rendered side by side."""
+    """Yield the first held-out view of a fit side by side: recorded, rendered, and the error."""
     for frame in clip.frames():
         view = next(iter(frame.views()))
         score = psnr(view.rendered, view.recorded, view.valid)
-        images = (label(view.recorded, "recorded"), label(view.rendered, f"{score:.1f} dB"))
-        yield side_by_side(images)
+        yield side_by_side(
+            [
+                label(view.recorded, "recorded"),
+                label(view.rendered, f"rendered, {score:.1f} dB"),
+                explained_image("error", np.abs(view.rendered / 255 - view.recorded / 255)),
+            ]
+        )
 
 
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -79,18 +80,21 @@ def quantity(count: int, noun: str) -> str:
     return f"{count} {noun if count == 1 else noun + 's'}"
 
 
-def print_result(text: str, styles: Mapping[str, str] | None = None) -> None:
-    """Print to standard output; on a terminal, lines are wrapped between words, and words have the
-    styles of Rich that `styles` names.
+def print_result(text: str, style: str = "") -> None:
+    """Print to standard output; on a terminal, lines are wrapped between words, in a style of Rich.
 
     Raises:
         OSError: it is full or closed; the error names it.
     """
-    content = Text(printable(text))
-    for word, style in (styles or {}).items():
-        content.highlight_words([word], style)
+    text = printable(text)
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns
+        text = "\n".join(
+            textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+            for line in text.split("\n")
+        )
     with naming_output():
-        OUT.print(content, soft_wrap=not sys.stdout.isatty(), overflow="ignore", crop=False)
+        OUT.print(text, style=style, soft_wrap=True)
 
 
 def print_next(*words: object) -> None:

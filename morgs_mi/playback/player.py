@@ -97,33 +97,38 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
 
 
 def explained_image(
-    name: str, image: np.ndarray, motion_scale: float | None = None, title: str | None = None
+    name: str, image: np.ndarray, motion_scale: float | None = None, title: str = ""
 ) -> np.ndarray:
-    """Return the `channel_image` of a channel with its legend: a label with the values of the first
-    and the last colour, and the wheel of motion in the lower right corner or a bar of the colours
-    along the lower edge. Colour, alpha and others have none.
+    """Return the `channel_image` of a channel, unless it is the colour with its legend: a label
+    with the values of the first and the last colour, and the wheel of motion in the lower right
+    corner or a bar of the colours along the lower edge.
 
     Args:
         name: of the channel.
         image: values of the channel [H, W, C].
         motion_scale: as for `channel_image`.
-        title: start of the label; None: the name.
+        title: start of the label, by default the name.
     """
     H, W = image.shape[:2]
-    motion_scale = motion_scale or MOTION_SCALE * W
-    picture = channel_image(name, image, motion_scale)
-    limits = {"motion": (0, motion_scale), "confidence": (0, 1), "error": (0, LARGEST_ERROR)}
-    if name not in (*limits, "depth"):
+    scale = motion_scale or MOTION_SCALE * W
+    picture = channel_image(name, image, scale)
+    if name == "color":
         return picture
-    least, largest = limits.get(name) or depth_limits(image)
+    limits = {
+        "motion": (0, scale),
+        "error": (0, LARGEST_ERROR),
+        "depth": depth_limits(image),
+    }
+    least, largest = limits.get(name, (0, 1))
     text = f"{title or name}, {least:.3g} to {largest:.3g}"
     if name == "motion":
         size = H // 5 + 1
-        picture[-size:, -size:] = motion_legend(motion_scale, size)
+        picture[-size:, -size:] = motion_legend(scale, size)
         text += " px"
     else:
-        ramp = np.linspace(least, largest, W)[None, :, None]
-        picture[-(H // 30 + 1) :] = channel_image(name, ramp)
+        size = H // 30 + 1
+        picture[-size - 1 :] = 255
+        picture[-size:] = channel_image(name, np.linspace(least, largest, W)[None, :, None])
     return label(picture, text)
 
 

@@ -91,7 +91,7 @@ def confidence_image(confidence: np.ndarray) -> np.ndarray:
     """Return [H, W] or [H, W, 1] in [0, 1] as colours: dark violet is static, bright yellow is
     moving.
     """
-    return _apply_colour_map(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
+    return _apply_colour_map(confidence, cv2.COLORMAP_INFERNO)
 
 
 def error_image(error: np.ndarray) -> np.ndarray:
@@ -159,7 +159,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
 
 
 def _apply_colour_map(values: np.ndarray, colour_map: int) -> np.ndarray:
-    grey = to_uint8(values.reshape(values.shape[:2]))[..., 0]
+    grey = to_uint8(np.reshape(values, np.shape(values)[:2]))[..., 0]
     return cv2.cvtColor(cv2.applyColorMap(grey, colour_map), cv2.COLOR_BGR2RGB)
 
 

@@ -40,8 +40,8 @@ from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, RigCheck, 
 from morgs_mi.extras.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.fit.forecast import forecast
 
-# Styles of the words for the expected quality.
-_STYLES = {"good": "bold green", "fair": "bold yellow", "poor": "bold red"}
+# Colours of the verdict on views between the cameras.
+_STYLES = {"good": "green", "fair": "yellow", "poor": "red"}
 # Columns of a camera, after its index and name.
 _COLUMNS = (
     "size",
@@ -101,7 +101,8 @@ class Info:
                 points += f" ({len(capture.points)} can be triangulated)"
         train_cameras = [capture.cameras[v] for v in capture.train_views]
         if len(train_cameras) > 1:
-            print_result(forecast(train_cameras, capture.points).sentence, _STYLES)
+            views = forecast(train_cameras, capture.points)
+            print_result(views.sentence, _STYLES[views.quality])
         if rig_check is not None:
             error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
             print_result(
