@@ -24,6 +24,7 @@ from morgs_mi.cli.streams import (
     Background,
     DropInvalid,
     ExportKind,
+    Front,
     on_background,
     opened,
     relative_to,
@@ -134,6 +135,7 @@ class Web(ExportKind):
     by default OUT/player.html or OUT/web."""
     title: Annotated[str | None, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
+    front: Front = None
     background: Background = None
 
     formats = WEB
@@ -142,6 +144,7 @@ class Web(ExportKind):
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
+        from morgs_mi.playback.stream_header import find_camera
 
         if self.background is not None and chosen.folder:
             raise ValueError(
@@ -149,6 +152,9 @@ class Web(ExportKind):
                 "unchanged."
             )
         on_background(stream, self.background)
+        if self.front is not None:
+            first = find_camera(stream, self.front)
+            stream.cameras = (first, *(c for c in stream.cameras if c is not first))
         total = len(frame_numbers(stream))
         write = write_web_folder if chosen.folder else write_web_page
         size = write(stream, output, self.title, lambda done: report("Checking", done, total))

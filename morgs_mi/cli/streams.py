@@ -34,6 +34,9 @@ _BACKGROUND = (
 )
 Background = Annotated[str | None, arg(metavar="COLOR", help=_BACKGROUND)]
 """Option of the commands that draw a stream."""
+_FRONT = "Camera at which the page opens, by name or index; by default the first one."
+Front = Annotated[str | None, arg(metavar="CAMERA", help=_FRONT)]
+"""Option of the commands that show a page."""
 _COLORS = {"black": "#000000", "grey": "#808080", "white": "#ffffff"}
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import webbrowser
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import quote
 
 from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
 from morgs_mi.cli.settings import optional, options
-from morgs_mi.cli.streams import DropInvalid, opened
+from morgs_mi.cli.streams import DropInvalid, Front, opened
 
 
 @options
@@ -29,19 +30,26 @@ class View:
     """Open the page in the browser of this machine."""
     follow: bool = False
     """Begin at the newest frame."""
+    front: Front = None
     capture: Annotated[Path | None, optional("FOLDER")] = None
     """Folder of the capture with the recorded images; by default the one that was fitted."""
     drop_invalid: DropInvalid = False
 
     def run(self) -> None:
+        from morgs_mi.playback.stream_header import find_camera
         from morgs_mi.playback.viewer.server import Viewer
 
-        viewer = Viewer(opened(self.source, self.drop_invalid), self.host, self.port, self.capture)
-        print_result(f"{viewer.url} (Ctrl-C to stop)")
+        stream = opened(self.source, self.drop_invalid)
+        wishes = ["follow"] if self.follow else []
+        if self.front is not None:
+            wishes.append(f"camera={quote(find_camera(stream, self.front).name)}")
+        viewer = Viewer(stream, self.host, self.port, self.capture)
+        url = f"{viewer.url}#{'&'.join(wishes)}" if wishes else viewer.url
+        print_result(f"{url} (Ctrl-C to stop)")
         if viewer.is_public:
             print_result(
                 "Other machines open the same link with the address of this machine in digits."
             )
         if self.browser:
-            webbrowser.open(viewer.url + ("#follow" if self.follow else ""))
+            webbrowser.open(url)
         viewer.run()

@@ -147,6 +147,8 @@ def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
     assert main(["export", "web", str(tmp_path)]) == 0
     assert main(["export", "web", str(tmp_path), str(tmp_path / "site"), "--title", "A clip"]) == 0
     assert (tmp_path / "player.html").stat().st_size > 1e6
+    assert main(["export", "web", str(tmp_path), str(tmp_path / "right"), "--front", "right"]) == 0
+    assert open_stream(tmp_path / "right").cameras[0].name == "right"
     assert b"<title>A clip</title>" in (tmp_path / "site" / "index.html").read_bytes()
     assert "player.html: 4 frames" in " ".join(capsys.readouterr().out.split())
 

@@ -525,6 +525,7 @@ def test_viewer__starts_whatever_a_header_calls_its_capture(tmp_path, capture):
     [
         ((), r"http://127\.0\.0\.1:\d+/", ""),
         (("--follow",), r"http://127\.0\.0\.1:\d+/", "#follow"),
+        (("--front", "2"), r"http://127\.0\.0\.1:\d+/", "#camera=right"),
         (("--no-browser", "--host", "0.0.0.0"), r"http://localhost:\d+/[\w-]{40,}/", None),
     ],
 )
