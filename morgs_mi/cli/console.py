@@ -93,9 +93,9 @@ def print_result(text: str, style: str = "") -> None:
             textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
             for line in text.split("\n")
         )
-    with OUT.capture() as captured:  # Rich would end the process where a pipe is closed
-        OUT.print(text, style=style, soft_wrap=True)
     with naming_output():
+        with OUT.capture() as captured:  # Rich would end the process where a pipe is closed
+            OUT.print(text, style=style, soft_wrap=True)
         print(captured.get(), end="")
 
 

@@ -110,21 +110,18 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(
     os.mkdir("out")
     Path("short.toml").write_text(SHORT_FITS, encoding="utf-8")
     frames = {}
-    outputs = {}
     for command in COMMANDS:
         name, *rest = shlex.split(command)
         if name == "ln":
             subprocess.run([name, *rest], check=True)
             continue
-        status, output, error = run(*rest, *(shlex.split(QUICK) if rest[0] == "fit" else ()))
+        status, _, error = run(*rest, *(shlex.split(QUICK) if rest[0] == "fit" else ()))
         assert status == 0, f"{command}\n{error}"
-        outputs[rest[0]] = output
         if rest[0] == "fit":
             frames[rest[2]] = len(read_json(Path(rest[2], "report.json"))["frames"])
     assert [frames.pop(f"out/{name}") for name in ("nerfstudio", "vggt")] == [1, 1]
     assert frames.pop("out/dynamic3dgs") == layouts.COUNT
     assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "3dgstream")}
-    assert outputs["info"].startswith("Views between the cameras will be ")
 
 
 def test_coming_from__names_a_command_for_each_tool():
