@@ -231,7 +231,8 @@ def fit_first_frame(
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )
         losses = optimise(optimizer, rates, losses_at, chunk)
-    progress(steps, steps)  # the last ones may have been skipped
+    if pace.count < steps:  # perhaps the last ones were skipped
+        progress(steps, steps)
     return FirstFrame(start.with_parameters(values_of(optimizer)), losses, pace.count)
 
 
