@@ -61,7 +61,7 @@ def test_cells__show_images_streams_and_progress():
         cells=[nbformat.v4.new_code_cell(cell) for cell in [*cells, "stream()"]]
     )
     client = nbclient.NotebookClient(
-        notebook, timeout=120, resources={"metadata": {"path": str(ROOT)}}
+        notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}
     )
     client.execute()
     _, image, *bars, stream = notebook.cells
@@ -80,7 +80,7 @@ def test_cells__show_images_streams_and_progress():
 def test_notebooks__run(path):
     notebook = nbformat.read(path, as_version=4)
     client = nbclient.NotebookClient(
-        notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(ROOT)}}
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(ROOT)}}
     )
     client.execute()  # raises where a cell fails
 
