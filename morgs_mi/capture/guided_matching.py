@@ -57,16 +57,20 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     centres = np.array([a.position, b.position])
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
-    # The fundamental matrix, by which a pixel of `a` has its line in `b`.
-    relative = b.world_to_camera @ np.linalg.inv(a.world_to_camera)
-    essential = np.cross(relative[:3, 3], relative[:3, :3], axisb=0, axisc=0)
-    fundamental = np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
+    fundamental = _fundamental(a, b)
     x, y = (np.column_stack([v, np.ones(len(v))]) for v in (x, y))
     of_x = x @ fundamental.T
     of_y = y @ fundamental
     slopes = np.minimum(np.hypot(*of_x[:, :2].T)[:, None], np.hypot(*of_y[:, :2].T))
     with np.errstate(divide="ignore", invalid="ignore"):  # the epipoles have no lines
         return np.abs(of_x @ y.T) / slopes
+
+
+def _fundamental(a: Camera, b: Camera) -> np.ndarray:
+    """Return the fundamental matrix [3, 3], by which a pixel of `a` has its line in `b`."""
+    relative = b.world_to_camera @ np.linalg.inv(a.world_to_camera)
+    essential = np.cross(relative[:3, 3], relative[:3, :3], axisb=0, axisc=0)
+    return np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
 
 
 def _patches_agree(
@@ -76,16 +80,23 @@ def _patches_agree(
     pixels = np.concatenate(Match((0, 1), pairs).pixels((a, b)))
     points = intersect_pairs(pixels, (0, 1), (first, second))
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The axes of the first patches, as the second camera sees them on planes that face both.
-        rays = [points - camera.position for camera in (first, second)]
-        normals = sum(map(unit_vectors, rays))
-        ends = first.project(points)[0] + a.axes[pairs[:, 0]]
-        directions = first.unproject(ends, np.ones(len(points))) - first.position
-        scale = (rays[0] * normals).sum(axis=1) / (directions * normals).sum(axis=1)
-        ends = second.project(first.position + scale[:, None] * directions)[0]
-        expected = ends - second.project(points)[0]
+        expected = _carried(points, a.axes[pairs[:, 0]], first, second)
         axes = b.axes[pairs[:, 1]]
         expected_length, length = (np.linalg.norm(vectors, axis=1) for vectors in (expected, axes))
         octaves = np.log2(expected_length / length)
         cosines = (expected * axes).sum(axis=1) / expected_length / length
     return (np.abs(octaves) <= _MAX_OCTAVES) & (cosines >= np.cos(np.deg2rad(_MAX_TURN)))
+
+
+def _carried(points: np.ndarray, vectors: np.ndarray, first: Camera, second: Camera) -> np.ndarray:
+    """Return image vectors at points [M, 3] as another camera sees them [M, 2], on planes that face
+    both cameras.
+    """
+    rays = [points - camera.position for camera in (first, second)]
+    normals = sum(map(unit_vectors, rays))
+    directions = (
+        first.unproject(first.project(points)[0] + vectors, np.ones(len(points))) - first.position
+    )
+    scale = (rays[0] * normals).sum(axis=1) / (directions * normals).sum(axis=1)
+    ends = first.position + scale[:, None] * directions
+    return second.project(ends)[0] - second.project(points)[0]

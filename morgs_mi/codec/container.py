@@ -93,6 +93,7 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
 
 
 def _fields_of(camera: Camera) -> dict[str, Any]:
+    """Return the JSON object of a camera in a header."""
     fields = {key: getattr(camera, key) for key in _CAMERA}
     if camera.background is not None:
         image = png_bytes(byte_values(camera.background))
@@ -175,6 +176,7 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
 
 
 def _image_of(text: Any, where: str, size: tuple[int, int]) -> np.ndarray:
+    """Return the image [H, W, 3] of a PNG file in base64; `size` is (W, H)."""
     image = None
     with contextlib.suppress(TypeError, ValueError):
         data = base64.b64decode(text)
@@ -182,7 +184,10 @@ def _image_of(text: Any, where: str, size: tuple[int, int]) -> np.ndarray:
         if imagesize.get(io.BytesIO(data)) == size:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     if image is None:
-        raise ValueError(f"`{where}` must be a PNG image of {size[0]}x{size[1]} pixels in base64")
+        raise ValueError(
+            f"`{where}` must be a PNG image of {size[0]}x{size[1]} pixels in base64, got "
+            f"{text!r:.60}"
+        )
     return image
 
 

@@ -100,8 +100,9 @@ def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
     in front.
     """
     focus = np.append(focus_point(cameras), 1)
+    least = 1e-3 * scene_extent(cameras)
     depths = np.array([camera.world_to_camera[2] @ focus for camera in cameras])
-    return np.where(depths > 1e-3 * scene_extent(cameras), depths, np.inf)
+    return np.where(depths > least, depths, np.inf)
 
 
 def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,17 +141,7 @@ def with_near_planes(
     """
     if near is not None:
         return tuple(replace(camera, near=near) for camera in cameras)
-    # A depth within which each camera shares nothing with the others, by the rig alone; 0 if
-    # unknown.
-    positions = positions_of(cameras)
-    focus = focus_depths(cameras)
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    nearest = distances.min(axis=1)
-    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
-    # Cameras at one place are apart by rounding errors.
-    rounding = 1e-9 * np.abs(positions).max()
-    depths = np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
+    depths = _rig_depths(cameras)
     for i, camera in enumerate(cameras):
         _, _, z = seen_points(replace(camera, near=_IN_FRONT), points)
         if len(z) >= _RELIABLE_POINTS:
@@ -176,6 +167,21 @@ def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray)
         f"{cameras[0].near:g} world units where it is {depths[0]:.3g} away",
         "pass with_near_planes(cameras, points), or cameras with a smaller `near`",
     )
+
+
+def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
+    0 if unknown.
+    """
+    positions = positions_of(cameras)
+    focus = focus_depths(cameras)
+    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    nearest = distances.min(axis=1)
+    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
+    # Cameras at one place are apart by rounding errors.
+    rounding = 1e-9 * np.abs(positions).max()
+    return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
 
 
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
@@ -244,7 +250,8 @@ def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndar
 
 def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
     """Return the angle between two cameras as seen from each point, degrees."""
-    x, y = map(unit_vectors, [camera.position - points for camera in (a, b)])
+    rays = [camera.position - points for camera in (a, b)]
+    x, y = map(unit_vectors, rays)
     return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
 
 

@@ -196,8 +196,15 @@ def picture(
     channel: str = "color",
     motion_scale: float = np.nan,
 ) -> np.ndarray:
-    """Return the `channel_image` of Gaussians of a stream, with the colours of a display; that of
-    motion lies over the grey image.
+    """Return a channel of a stream's Gaussians as the players show it, uint8 RGB [H, W, 3]: a
+    `channel_image`, colour at the display exposure, motion over the grey image.
+
+    Args:
+        stream: the file, with the settings of the renderer.
+        gaussians: of one of its frames.
+        camera: any view.
+        channel: such as ``motion``.
+        motion_scale: speed of full saturation in pixels; needed for motion.
     """
     config = render_config(stream)
     values = render(gaussians, camera, (channel,), config)[channel]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -37,6 +38,24 @@ from morgs_mi.stream_loop import StreamLoop
 
 # Fewer points are replaced by triangulated ones, if there are more of those.
 _FEW_POINTS = 100
+
+
+@dataclass
+class _FirstFrameProgress:
+    """Report that also notes the progress of the first frame, which viewers show."""
+
+    report: Report | None
+    seconds: float = 0.0  #: Since its first step.
+    share: float = 0.0  #: Of its steps.
+    begin: float | None = None
+
+    def __call__(self, stage: str, done: float, total: float) -> None:
+        if stage.startswith("First frame"):
+            self.begin = self.begin or time.perf_counter()
+            self.seconds = time.perf_counter() - self.begin
+            self.share = done / total
+        if self.report is not None:
+            self.report(stage, done, total)
 
 
 @interrupts_raised()
@@ -83,7 +102,8 @@ def stream_capture(
     check_capacity(
         "stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit
     )
-    stages = Progress(progress)
+    watched = _FirstFrameProgress(progress)
+    stages = Progress(watched)
     with locked_folder(out, "stream_capture()"):
         files = FitFiles.of(out)
         metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
@@ -103,7 +123,7 @@ def stream_capture(
         with Recording(files, prepared.capture, metadata, earlier) as recording:
 
             def show(keyframe: Packet) -> None:
-                recording.show(keyframe)
+                recording.show(keyframe, {"seconds": watched.seconds, "share": watched.share})
                 if on_provisional is not None:
                     on_provisional(keyframe)
 

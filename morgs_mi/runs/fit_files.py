@@ -172,9 +172,9 @@ class Recording:
         if kind is None:
             self._check_in_place()
 
-    def show(self, keyframe: Packet) -> None:
+    def show(self, keyframe: Packet, progress: Mapping[str, float] | None = None) -> None:
         """Write a provisional first frame beside the stream, which viewers show until the stream
-        has its first frame.
+        has its first frame, with the progress of its fit in the header's metadata.
 
         If it cannot be written, e.g. because the disk has room for the result alone, a warning is
         logged, and it and later ones are skipped.
@@ -185,7 +185,10 @@ class Recording:
             with (
                 atomic_path(self._files.provisional, "Recording.show()") as partial,
                 StreamWriter(
-                    partial, self._capture.cameras, self._capture.fps, self._metadata
+                    partial,
+                    self._capture.cameras,
+                    self._capture.fps,
+                    {**self._metadata, "provisional": progress},
                 ) as writer,
             ):
                 writer.write(keyframe)

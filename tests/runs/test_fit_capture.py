@@ -23,6 +23,7 @@ from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.files import PROVISIONAL
+from morgs_mi.fit.first_frame import density_rounds
 from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next
@@ -113,6 +114,7 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path, monkeypatch):
     removed before the result is written.
     """
     shown = []
+    shares = []
     show = Files.show
     write = StreamWriter.write
 
@@ -120,11 +122,13 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path, monkeypatch):
         assert "provisional" in writer.path.name or not (tmp_path / PROVISIONAL).exists()
         return write(writer, packet)
 
-    def spy(files, keyframe):
-        show(files, keyframe)
+    def spy(files, keyframe, progress):
+        show(files, keyframe, progress)
         provisional = StreamReader(tmp_path / PROVISIONAL)
         shown.append([packet.encoded for packet in provisional])
-        assert provisional.metadata == StreamReader(tmp_path / "stream.morgs").metadata
+        metadata = provisional.metadata
+        shares.append(metadata.pop("provisional")["share"])
+        assert metadata == StreamReader(tmp_path / "stream.morgs").metadata
         assert not StreamReader(tmp_path / "stream.morgs").index()
 
     monkeypatch.setattr(Files, "show", spy)
@@ -135,6 +139,7 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path, monkeypatch):
     stream_capture(recording(num_frames=2), tmp_path, replace(CONFIG, fit=fit))
     first = next(iter(StreamReader(tmp_path / "stream.morgs")))
     assert len(shown) == 3
+    assert shares == [step / 20 for step in density_rounds(fit)]
     assert [first.encoded] not in shown
     assert not (tmp_path / PROVISIONAL).exists()
 

@@ -3,7 +3,7 @@
 import { positionOf } from "./cameras";
 import { CONFIDENCE_GRADIENT } from "./colors";
 import { Playback } from "./playback";
-import { Overlay, type Part, Server } from "./server";
+import { Overlay, type Part, psnr, Server } from "./server";
 import { GROUNDS, type Mode, MODES, Splats } from "./splats";
 import { type CameraFields, download } from "./stream";
 import { View } from "./view";
@@ -53,7 +53,7 @@ function note(topic: string, text: string): void {
   const line = notes.querySelector(`[data-topic=${topic}]`) ?? notes.appendChild(document.createElement("div"));
   (line as HTMLElement).dataset.topic = topic;
   line.textContent = text;
-  notes.hidden = notes.textContent === "";
+  notes.hidden = notes.textContent!.trim() === "";
 }
 
 async function begin(): Promise<void> {
@@ -89,6 +89,8 @@ function unitOf(cameras: CameraFields[]): number {
 }
 
 interface Metadata {
+  /** Seconds since the first step of the first frame, and the share of its steps that is done. */
+  provisional?: { seconds: number; share: number };
   config?: { render?: object };
   motion_scale?: number;
   default_rig?: boolean;
@@ -119,6 +121,9 @@ class Player {
   private stream: Opened | null = null;
   /** Description of the end of a stream that may still grow. */
   private damage: string | null = null;
+  /** Whether the first frame is provisional, and the PSNR of those that were, dB over seconds. */
+  private provisional = false;
+  private readonly curve: number[][] = [];
   /** Time of the last change of what is shown. */
   private changed = 0;
   private readonly recorded = new Overlay(
@@ -155,6 +160,7 @@ class Player {
         this.changed = performance.now();
         this.count();
         if (!this.started) this.start();
+        if (this.provisional) void this.describe(update.count);
       },
       failed: (message) => {
         if (this.started) this.sayDamage(message);
@@ -193,6 +199,8 @@ class Player {
   private take({ bytes, whole, provisional }: Part, server: Server): void {
     if (whole) {
       this.damage = null;
+      this.provisional = provisional;
+      setFlag("curve", "hidden", !provisional);
       note("provisional", provisional ? "Provisional first frame: it is still being fitted." : "");
       this.playback.open(bytes);
     } else if (this.stream === null) {
@@ -200,6 +208,24 @@ class Player {
     } else {
       this.playback.extend(bytes);
     }
+  }
+
+  /** Describe the provisional first frame, with the PSNR of the selected camera over the time of the fit. */
+  private async describe(count: number): Promise<void> {
+    const { seconds, share } = (this.stream!.metadata as Metadata).provisional ?? { seconds: 0, share: 0 };
+    const left = share > 0 ? `, about ${Math.round((seconds * (1 - share)) / share)} s left` : "";
+    const text = `Provisional first frame: ${count} Gaussians after ${Math.round(seconds)} s${left}`;
+    note("provisional", `${text}.`);
+    if (!this.hasRecording) return;
+    const value = await psnr(this.cameras[0], 0, this.frames[0]).catch(() => NaN);
+    if (!this.provisional || !Number.isFinite(value)) return;
+    this.curve.push([seconds, value]);
+    note("provisional", `${text}, ${value.toFixed(1)} dB at ${this.cameras[0].name}.`);
+    const [times, decibels] = [0, 1].map((i) => this.curve.map((point) => point[i]));
+    const least = Math.min(...decibels) - 1;
+    const height = 30 / (Math.max(...decibels) - least);
+    const points = times.map((time, i) => `${(100 * time) / seconds},${30 - height * (decibels[i] - least)}`);
+    element("curve").querySelector("polyline")!.setAttribute("points", points.join(" "));
   }
 
   private sayDamage(damage: string): void {
@@ -355,7 +381,8 @@ class Player {
     setFlag("split", "hidden", !splits);
     setFlag("share", "hidden", !splits);
     const rests = !playback.playing && !playback.busy && now - this.changed > REST;
-    const draws = this.splats.mode !== "depth";
+    // The server has no such images.
+    const draws = this.splats.mode !== "depth" && this.cameras[Number(cameraList.value)].background === undefined;
     this.exact.show(pressed("exact") && rests && draws ? this.exactAddress(frame) : null);
     setFlag("exact", "data-busy", !this.exact.settled);
   }

@@ -1,5 +1,7 @@
 /** The server of `morgs-mi view`: a stream that may grow, and images of it (morgs_mi/playback/viewer). */
 
+import type { CameraFields } from "./stream";
+
 export interface Part {
   bytes: Uint8Array<ArrayBuffer>;
   /** Whether these are all bytes of the stream, not those by which it has grown. */
@@ -44,6 +46,21 @@ export class Server {
     this.etag = null;
     this.length = 0;
   }
+}
+
+/** Return the PSNR of the exact image of a recorded camera against the recorded image, dB. */
+export async function psnr({ background: _, ...camera }: CameraFields, view: number, frame: number): Promise<number> {
+  const query = new URLSearchParams({ camera: JSON.stringify(camera), scale: "1" });
+  const pixels = async (address: string) => {
+    const bitmap = await createImageBitmap((await requested(address))!);
+    const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d")!;
+    context.drawImage(bitmap, 0, 0);
+    return context.getImageData(0, 0, bitmap.width, bitmap.height).data;
+  };
+  const [truth, image] = await Promise.all([`recorded/${view}/${frame}`, `exact/${frame}/color?${query}`].map(pixels));
+  let squares = 0;
+  for (let i = 0; i < truth.length; i++) squares += (truth[i] - image[i]) ** 2;
+  return 10 * Math.log10((0.75 * truth.length * 255 ** 2) / squares); // one of four values is alpha
 }
 
 /** Time until an image is requested again after the server has turned to a newer request, in milliseconds. */

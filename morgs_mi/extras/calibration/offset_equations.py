@@ -88,9 +88,10 @@ class OffsetEquations:
         inverse = self._inverse(_FLOOR)
         blindness = np.eye(len(inverse)) - inverse @ self.matrix
         noise = inverse - inverse[reference]
+        lost_part = blindness - blindness[reference]
         return np.sqrt(
             np.einsum("vi,ij,vj->v", noise, self.scatter, noise)
-            + UNKNOWN**2 * ((blindness - blindness[reference]) ** 2).sum(axis=1)
+            + UNKNOWN**2 * (lost_part**2).sum(axis=1)
         )
 
     def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:
@@ -100,15 +101,19 @@ class OffsetEquations:
         scale = self.own.mean() or 1.0
         diagonal = np.diag(self.matrix) + _FLOOR * scale
         whole = np.zeros_like(self.matrix)
-        # The inverse of the damped block among vectors with a mean of zero.
-        centred = np.eye(train.sum()) - 1 / train.sum()
-        values, vectors = np.linalg.eigh(centred @ self.matrix[block] @ centred)
-        inverse = (vectors / (np.maximum(values, 0) + damping * scale)) @ vectors.T
-        whole[block] = centred @ inverse @ centred / share
+        whole[block] = _centred_inverse(self.matrix[block], damping * scale) / share
         for view in np.flatnonzero(~train):
             unit = np.eye(len(train))[view]
             whole[view] = (unit - self.matrix[view, train] @ whole[train]) / diagonal[view]
         return whole
+
+
+def _centred_inverse(matrix: np.ndarray, damping: float) -> np.ndarray:
+    """Return the inverse of a damped matrix [n, n] among vectors with a mean of zero."""
+    centred = np.eye(len(matrix)) - 1 / len(matrix)
+    values, vectors = np.linalg.eigh(centred @ matrix @ centred)
+    inverse = (vectors / (np.maximum(values, 0) + damping)) @ vectors.T
+    return centred @ inverse @ centred
 
 
 def offset_equations(
@@ -133,7 +138,7 @@ def offset_equations(
     means = np.asarray(gaussians.means, np.float64)[moving]
     products = []
     for view, target in zip(views, targets, strict=True):
-        error = blurred(target.difference(view.render(gaussians).color), blur)
+        error = blurred(target.difference(view.render(gaussians, ("color",)).color), blur)
         gradient = image_gradient(blurred(target.image(), blur))
         products.append(gradient_products(gaussians, view, error, gradient))
     A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))

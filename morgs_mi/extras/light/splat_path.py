@@ -34,7 +34,8 @@ from morgs_mi.core.types import Bool, Float
 from morgs_mi.extras.light.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
 
-reload(common)  # else its classes are those of the variant before, until one of them is used
+# Mitsuba reloads this module when one of its own integrators is first used in another variant.
+reload(common)
 
 _PROPERTIES = {
     "max_depth": Annotated[int, Ge(-1)],
