@@ -21,6 +21,11 @@ export interface Seen {
   moves: boolean;
 }
 
+/** Return the value below which a fraction of the values lies; undefined: there are none. */
+export function quantile(values: number[], fraction = 0.5): number | undefined {
+  return values.sort((a, b) => a - b)[Math.floor(fraction * (values.length - 1))];
+}
+
 /** Options of a SparkRenderer that draws as the package's renderer does; `metadata` is the stream's. */
 export function rendererOptions(metadata: Record<string, unknown>) {
   const { config } = metadata as { config?: { render?: object } };
@@ -216,8 +221,7 @@ export class StreamMesh extends SplatMesh {
 
   /** Median depth of the Gaussians in front of a camera, in world units. */
   medianDepth(camera: THREE.PerspectiveCamera): number {
-    const depths = this.seen(camera).map(({ depth }) => depth);
-    return depths.sort((a, b) => a - b)[depths.length >> 1] ?? 1;
+    return quantile(this.seen(camera).map(({ depth }) => depth)) ?? 1;
   }
 
   /** The first opaque surface at a place of the image, in normalised coordinates, or null. */

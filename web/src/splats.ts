@@ -4,7 +4,7 @@ import { dyno, SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { FullScreenQuad } from "three/addons/postprocessing/Pass.js";
 import { CONFIDENCE_COLORS } from "./colors";
-import { background, rendererOptions, type Seen, StreamMesh, TEXELS } from "./mesh";
+import { background, quantile, rendererOptions, type Seen, StreamMesh, TEXELS } from "./mesh";
 import type { Update } from "./update";
 import type { Rectangle } from "./view";
 
@@ -178,8 +178,7 @@ export class Splats {
   /** Scale the colours of depth to what a camera sees, and return the nearest and the farthest depth, page units. */
   scaleDepth(camera: THREE.PerspectiveCamera): number[] {
     const depths = this.mesh.seen(camera).map(({ depth }) => depth);
-    depths.sort((a, b) => a - b);
-    const [near, far] = [0.02, 0.98].map((fraction) => depths[Math.floor(fraction * (depths.length - 1))] ?? 1);
+    const [near, far] = [0.02, 0.98].map((fraction) => quantile(depths, fraction) ?? 1);
     this.uniforms.depths.value.set(1 / near, 1 / far);
     this.mesh.updateVersion();
     return [near, far];

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { axisOf, fovOf, positionOf, turntableUp } from "./cameras";
-import type { Seen } from "./mesh";
+import { quantile, type Seen } from "./mesh";
 import type { CameraFields } from "./stream";
 
 /**
@@ -19,7 +19,7 @@ const AT_CAMERA = 1e-4;
 
 /** Share of the Gaussians of a file on each side that may lie outside of the first view, and the margin around the others. */
 const OUTSIDE = 0.025;
-const MARGIN = 1.06;
+const MARGIN = 1.15;
 /** Share of the distance to what the view orbits around by which a key moves it. */
 const STRIDE = 0.06;
 
@@ -35,10 +35,6 @@ export interface Rectangle {
 export interface Place {
   position: number[];
   target: number[];
-}
-
-function middle(values: number[], fraction = 0.5): number | undefined {
-  return values.sort((a, b) => a - b)[Math.floor(fraction * (values.length - 1))];
 }
 
 export class View {
@@ -95,7 +91,7 @@ export class View {
     this.project();
     this.controls?.dispose();
     this.controls = new OrbitControls(camera, this.element);
-    this.controls.target.copy(camera.position).addScaledVector(ahead, middle(places.map(({ depth }) => depth)) ?? 1);
+    this.controls.target.copy(camera.position).addScaledVector(ahead, quantile(places.map(({ depth }) => depth)) ?? 1);
     this.controls.enableDamping = true;
     this.controls.dampingFactor = 0.15;
     this.controls.zoomSpeed = 0.7;
@@ -116,10 +112,10 @@ export class View {
       some.map((place) => this.current.width * toImage(place.x, x, width, this.size.width));
     const ys = places.map((place) => this.current.height * toImage(-place.y, y, height, this.size.height));
     if (this.recorded) {
-      this.motion = middle(xs(places.filter(({ moves }) => moves))) ?? this.motion;
+      this.motion = quantile(xs(places.filter(({ moves }) => moves))) ?? this.motion;
     } else if (places.length > 0) {
-      const [left, right] = [OUTSIDE, 1 - OUTSIDE].map((fraction) => middle(xs(places), fraction)!);
-      const [top, bottom] = [OUTSIDE, 1 - OUTSIDE].map((fraction) => middle(ys, fraction)!);
+      const [left, right] = [OUTSIDE, 1 - OUTSIDE].map((fraction) => quantile(xs(places), fraction)!);
+      const [top, bottom] = [OUTSIDE, 1 - OUTSIDE].map((fraction) => quantile(ys, fraction)!);
       const [w, h] = [MARGIN * (right - left), MARGIN * (bottom - top)];
       if (w > 0 && h > 0) this.subject = { x: (left + right - w) / 2, y: (top + bottom - h) / 2, width: w, height: h };
     }
