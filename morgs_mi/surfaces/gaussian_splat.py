@@ -486,5 +486,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def to_string(self) -> str:
         names = ("aovs", "background", "config", "srgb_primitives", "surfaces")
-        lines = ",\n".join(f"  {name} = {getattr(self, name)}" for name in names)
+        values = {name: getattr(self, name) for name in names}
+        if isinstance(self.background, mi.TensorXf):
+            values["background"] = f"an image {[*self.background.shape]}"
+        lines = ",\n".join(f"  {name} = {value}" for name, value in values.items())
         return f"GaussianSplatIntegrator[\n{lines}\n]"

@@ -346,6 +346,7 @@ def test_gaussian_splat__refuses_an_image_with_surfaces_and_of_another_size(raw)
     with pytest.raises(RuntimeError, match="must be a colour with `surfaces`, got an image"):
         mi.load_dict({"type": "gaussian_splat", "background": image, "surfaces": {"type": "path"}})
     scene = make_mitsuba_scene(to_gaussians(raw), background=image)
+    assert "background = an image [3, 4, 3]," in str(scene.integrator())
     with pytest.raises(ValueError, match=r"`background` must be three .* got float32 \[3, 4, 3\]"):
         scene.integrator().render(scene)
 
