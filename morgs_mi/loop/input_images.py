@@ -15,6 +15,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import kind_of
 from morgs_mi.core.color_space import positive_light
+from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.exposure import thumbnail
 
 InputImage: TypeAlias = Any
@@ -144,10 +145,12 @@ def image_status(names: Sequence[str], previous: Images, images: Images) -> tupl
             frame.
         images: of this frame, likewise.
     """
-    old_thumbnails, thumbnails = (
-        {v: thumbnail(image, _WIDTH).astype(np.float64) for v, image in some.items()}
-        for some in (previous, images)
+    small = map_in_threads(
+        lambda image: thumbnail(image, _WIDTH).astype(np.float64),
+        [*previous.values(), *images.values()],
     )
+    old_thumbnails = dict(zip(previous, small, strict=False))
+    thumbnails = dict(zip(images, small[len(previous) :], strict=True))
     plain = [v for v, image in thumbnails.items() if image.std((0, 1)).max() < _PLAIN]
     views = (v for v in thumbnails.keys() & previous.keys() if v not in plain)
     cuts = [v for v in views if _is_cut(old_thumbnails[v], thumbnails[v])]

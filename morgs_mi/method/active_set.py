@@ -94,6 +94,7 @@ def responsibility(
     for changed_view in views:
         boxes = changed_view.boxes
         area += boxes.area
+        dr.eval(near, area)  # one kernel for all views
         if not changed_view.change.any():
             continue
         view = changed_view.view
@@ -126,17 +127,16 @@ def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
     """Return the overlap o [N] of `count` Gaussians with the changes, from 0 to 1; 0 for one that
     is in no view.
     """
-    shares = np.zeros(count)
-    counts = np.zeros_like(shares)
+    shares = dr.zeros(mi.Float, count)
+    counts = dr.zeros(mi.Float, count)
     for changed_view in views:
-        area = np.asarray(changed_view.boxes.area)
-        counts += area > 0
+        boxes = changed_view.boxes
+        counts += dr.select(boxes.area > 0, 1, 0)
         if changed_view.change.any():
             table = from_numpy(mi.UInt32, summed_area(changed_view.counts > 0))
-            shares += np.asarray(
-                changed_view.boxes.within(table, changed_view.view.grid)
-            ) / np.maximum(area, 1)
-    return shares / np.maximum(counts, 1)
+            shares += boxes.within(table, changed_view.view.grid) / dr.maximum(boxes.area, 1)
+        dr.eval(shares, counts)  # one kernel for all views
+    return np.asarray(shares / dr.maximum(counts, 1))
 
 
 # Fraction of a connected change that active Gaussians must cover to explain it.
@@ -199,7 +199,9 @@ class ActiveSet:
         """
         if len(self.indices) == len(previous):
             return gaussians, source
-        static = np.setdiff1d(np.arange(len(previous)), self.indices)
+        is_static = np.ones(len(previous), bool)
+        is_static[self.indices] = False
+        static = np.flatnonzero(is_static)
         index = np.where(source < 0, len(previous), self.indices[source])
         previous_index = np.concatenate([static, index])
         order = np.argsort(previous_index, kind="stable")  # births come last

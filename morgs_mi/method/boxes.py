@@ -65,8 +65,9 @@ class Boxes:
 
     def union(self, selection: np.ndarray, grid: BlockGrid) -> np.ndarray:
         """Return the blocks, bool [rows, columns], that any box of a `selection` [N] touches."""
+        rows = np.flatnonzero(selection)
         x0, y0, x1, y1 = (
-            np.asarray(v)[selection].astype(np.int64)
+            np.asarray(v)[rows].astype(np.int64)
             for v in (self.left, self.top, self.right, self.bottom)
         )
         some = (x1 > x0) & (y1 > y0)

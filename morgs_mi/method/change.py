@@ -109,7 +109,7 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     threshold = np.maximum(config.sigmas * noise, _GREY_LEVEL).astype(np.float32)
     size = np.abs(average)
     exceeds = size > cv2.resize(threshold, change.shape[::-1])
-    return exceeds * np.where(size > config.min_peak, np.uint8(2), np.uint8(1))
+    return exceeds.astype(np.uint8) + (exceeds & (size > config.min_peak))
 
 
 def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
@@ -133,10 +133,13 @@ def moving_region(change: np.ndarray) -> np.ndarray:
         change: the `change_mask` [H, W].
     """
     margin = 2 * _CLOSING
-    closing = np.pad(change.astype(np.uint8), margin)
+    box = box_around(change) or np.s_[:, :]
+    closing = np.pad(change[box].astype(np.uint8), margin)
     closing = cv2.morphologyEx(closing, cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8))
     cv2.floodFill(closing, None, (0, 0), 2)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return (closing != 2)[margin:-margin, margin:-margin]
+    region = np.zeros_like(change)
+    region[box] = (closing != 2)[margin:-margin, margin:-margin]
+    return region
 
 
 def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:

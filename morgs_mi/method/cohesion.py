@@ -46,7 +46,8 @@ class NeighbourIndex:
 
     def __init__(self, points: np.ndarray) -> None:
         self._points = np.asarray(points)
-        self._tree = KDTree(self._points)
+        # Sliding midpoints are found faster than medians, for as fast queries.
+        self._tree = KDTree(self._points, balanced_tree=False, compact_nodes=False)
         self._of_all: dict[int, np.ndarray] = {}
 
     def nearest(self, count: int, rows: np.ndarray | None = None) -> np.ndarray:

@@ -77,23 +77,23 @@ def _checked_flow(
     source: FlowSource, pair: FramePair, config: FlowConfig | None
 ) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
-    backward, forward = source(pair)
-    valid = valid_pixels(pair.valid, backward.shape)
-    within = valid
-    if pair.box is not None:
-        within = np.zeros_like(valid)
-        within[pair.box] = valid[pair.box]
-    reliable, forward_reliable = (
-        consistency_mask(flow, back, config) & within
-        for flow, back in ((backward, forward), (forward, backward))
-    )
-    if pair.region is not None:
-        # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
-        backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
-        still = ~pair.region & valid
-        reliable = reliable | still
-        forward_reliable = forward_reliable | still
-    return FlowObservation(-backward, reliable, forward, forward_reliable)
+    box = pair.box or np.s_[:, :]
+    flows = [flow[box] for flow in source(pair)]
+    shape = pair.image.shape[:2]
+    valid = valid_pixels(pair.valid, shape)
+    # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
+    moves = np.ones(shape, bool) if pair.region is None else pair.region
+    masks = []
+    images = []
+    for flow, back in (flows, flows[::-1]):
+        mask = valid & ~moves
+        mask[box] |= valid[box] & consistency_mask(flow, back, config)
+        masks.append(mask)
+        image = np.zeros((*shape, 2), np.float32)
+        image[box] = np.where(moves[box][..., None], flow, 0)
+        images.append(image)
+    backward, forward = images
+    return FlowObservation(-backward, masks[0], forward, masks[1])
 
 
 def consistency_mask(

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import mitsuba as mi
 import numpy as np
@@ -74,6 +75,11 @@ class _Flows:
     variance: np.ndarray  # of the flow over the pixels of the Gaussian [V, N], px^2
     jacobian: np.ndarray  # J [V, N, 2, 3], px per world unit
     floor: np.ndarray  # of the motion [V, 1], px
+
+    @cached_property
+    def squares(self) -> np.ndarray:
+        """J' J [V, N, 3, 3]."""
+        return np.einsum("vnij,vnik->vnjk", self.jacobian, self.jacobian)
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return J d [V, N, 2] in px."""
@@ -155,8 +161,8 @@ def _solve(flows: _Flows, trust: np.ndarray) -> np.ndarray:
     """Return d [N, 3] of the system with the weights k = `trust` [V, N]."""
     J = flows.jacobian
     weight = trust * flows.weight
-    system = (weight[..., None, None] * np.einsum("vnij,vnik->vnjk", J, J)).sum(axis=0)
-    right = np.einsum("vnij,vni->vnj", J, weight[..., None] * flows.flow).sum(axis=0)
+    system = np.einsum("vn,vnjk->njk", weight, flows.squares)
+    right = np.einsum("vnij,vni->nj", J, weight[..., None] * flows.flow)
     # lambda, which has the unit of J' J.
     scales = np.median(np.sum(J[:, :, 0] ** 2, axis=-1), axis=-1)
     prior = max(_PRIOR_PIXELS * float(np.mean(scales)), 1e-30)

@@ -54,7 +54,7 @@ def test_initial_motion__runs_the_stages_that_are_on():
 def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch):
     """The stages and the cohesion share it; the search has its own, of displaced Gaussians."""
     built = []
-    monkeypatch.setattr(cohesion, "KDTree", lambda points: built.append(points) or KDTree(points))
+    monkeypatch.setattr(cohesion, "KDTree", lambda points, **_: built.append(0) or KDTree(points))
     start(replace(MotionConfig(), search_motion=False))
     assert len(built) == 1
 
