@@ -81,16 +81,15 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     return replace(capture, points=points, point_colors=colors)
 
 
-def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
-    """Return the capture with triangulated points instead of its own, and with stereo points where
-    cameras are close.
+def dense_points(capture: Capture, sparse: Capture, seed: int = 0) -> Capture:
+    """Return the capture with the points of `sparse`, see `triangulate_points`, and with stereo
+    points where cameras are close.
 
     Args:
         capture: a capture; its held-out view is not used.
-        shared: features of its first frame.
+        sparse: the capture with triangulated points.
         seed: seed of the selection of stereo points.
     """
-    sparse = triangulate_points(capture, shared)
     recorded = capture.at_recorded_size()
     images = next(recorded.displayed().partial_frames(0, 1)).images
     views = [

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import Positional
 
-from morgs_mi.cli.console import print_next, print_result, progress
+from morgs_mi.cli.console import print_next, print_result, print_warning, progress
 from morgs_mi.cli.settings import (
     Flag,
     GivenReading,
@@ -25,6 +27,7 @@ from morgs_mi.cli.settings import (
 )
 from morgs_mi.core.config import Count, check_value, config_toml
 from morgs_mi.core.files import STREAM
+from morgs_mi.core.progress import duration
 
 if TYPE_CHECKING:
     from morgs_mi.loop.frame_report import FrameReport
@@ -121,8 +124,18 @@ class Fit:
             from morgs_mi.runs.fit_capture import stream_capture
 
             stream = self.out / STREAM
+            begin = time.monotonic()
+            look = shlex.join(["morgs-mi", "view", str(self.out)])
+
+            @cache
+            def announce() -> None:
+                seconds = time.monotonic() - begin
+                print_warning(f"A first picture is there after {duration(seconds)}: {look}")
+
             with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
-                reports = stream_capture(capture, self.out, config, self.resume, report)
+                reports = stream_capture(
+                    capture, self.out, config, self.resume, report, lambda _: announce()
+                )
         _print_summary(self.out / STREAM, reports)
         print_next("view", self.out)
 

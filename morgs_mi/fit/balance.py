@@ -9,7 +9,7 @@ the recorded images is compared in withheld pixels, blocks of every view that no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,7 +76,11 @@ def short_fit_config(config: FitConfig) -> FitConfig:
 
 
 def balance_cameras(
-    problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress
+    problem: FirstFrameProblem,
+    config: FitConfig,
+    seed: int,
+    progress: Progress,
+    on_round: Callable[[Gaussians], None] | None = None,
 ) -> Balance:
     """Return the exposures with which the cameras agree, and whether withheld pixels show that they
     are better.
@@ -86,6 +90,7 @@ def balance_cameras(
         config: of the fit; `exposure` "on" takes the exposures in any case.
         seed: of all random choices.
         progress: of the fits, in one stage.
+        on_round: called with the Gaussians of each round.
     """
     report = progress.of("Balancing cameras")
     how = config.short_fits
@@ -110,6 +115,8 @@ def balance_cameras(
     gaussians = problem.start
     for k in range(how.rounds):
         gaussians = fitted(gaussians, exposures, -(-steps // 2) if k else steps)
+        if on_round is not None:
+            on_round(gaussians)
         # Relative to the Gaussians, without what most cameras have in common.
         exposures = centred(
             [

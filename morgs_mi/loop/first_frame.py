@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,6 +40,9 @@ from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
 
 _LOG = logging.getLogger(__name__)
+# Rounds of a preview, and the steps of the first one: 24 dB on basketball after two.
+_PREVIEWS = 3
+_PREVIEW_STEPS = 500
 
 
 @interrupts_raised()
@@ -112,7 +114,8 @@ def fitted_first_frame(
     """
     begin = time.perf_counter()
     config = setup.config
-    exposures, exposure_entry = _balanced(setup, observed.encoded, progress)
+    on_round = _on_round(setup, on_provisional)
+    exposures, exposure_entry = _balanced(setup, observed.encoded, progress, on_round)
     views = views_of(setup, corrected(observed.encoded, exposures))
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan, seconds = plan_first_frame(views, setup.points, config.fit)
@@ -120,10 +123,6 @@ def fitted_first_frame(
     problem = FirstFrameProblem.of(views, cloud, plan, config.render, rng)
     fit_config = adapted_to_images(plan, problem)
 
-    packet_of = partial(keyframe_packet, frame=0, cameras=setup.cameras, config=config.codec)
-    on_round = None
-    if on_provisional is not None:
-        on_round = lambda gaussians: on_provisional(packet_of(gaussians))  # noqa: E731
     status = "ok"
     if (count := len(setup.points)) < MIN_POINTS:
         status = (
@@ -143,7 +142,7 @@ def fitted_first_frame(
     elif limit is not None:
         limit = max(limit - (time.perf_counter() - begin), 1.0)
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round, limit)
-    packet = packet_of(fitted.gaussians)
+    packet = keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec)
     report = FrameReport(
         frame=0,
         seconds=0.0,
@@ -158,8 +157,33 @@ def fitted_first_frame(
     return packet, report
 
 
+def preview(setup: Setup, images: Frame, on_provisional: Callable[[Packet], None]) -> None:
+    """Make provisional keyframes by short fits of the first frame, for a picture within seconds
+    while better points are still to be found; arguments as for `step`.
+    """
+    fit = setup.config.fit
+    short_fits = replace(fit.short_fits, rounds=_PREVIEWS, steps=_PREVIEW_STEPS)
+    config = replace(setup.config, fit=replace(fit, exposure="on", short_fits=short_fits))
+    setup = replace(setup, config=config)
+    observed = observe_frame(setup, 0, ImageHistory(), images)
+    _balanced(setup, observed.encoded, Progress(), _on_round(setup, on_provisional))
+
+
+def _on_round(
+    setup: Setup, on_provisional: Callable[[Packet], None] | None
+) -> Callable[[Gaussians], None] | None:
+    """Return a function that makes a provisional keyframe of Gaussians; None: there are none."""
+    if on_provisional is None:
+        return None
+    cameras = setup.cameras
+    return lambda g: on_provisional(keyframe_packet(g, 0, cameras, setup.config.codec))
+
+
 def _balanced(
-    setup: Setup, images: Images, progress: Progress
+    setup: Setup,
+    images: Images,
+    progress: Progress,
+    on_round: Callable[[Gaussians], None] | None,
 ) -> tuple[tuple[Exposure, ...], dict[str, Any]]:
     """Return the exposures of all views by the balance of the cameras, empty if they are not
     estimated, and the entry of the first frame's report, from the images of the first frame.
@@ -174,7 +198,7 @@ def _balanced(
         fit = short_fit_config(config.fit)
         cloud = setup.points, setup.point_colors
         problem = FirstFrameProblem.of(views_of(setup, images), cloud, fit, config.render, rng)
-        balance = balance_cameras(problem, config.fit, config.seed, progress)
+        balance = balance_cameras(problem, config.fit, config.seed, progress, on_round)
         if balance.taken:
             exposures = dict(zip(images, balance.exposures, strict=True))
         entry["exposure"] = {

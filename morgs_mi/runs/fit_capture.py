@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.fingerprint import image_fingerprints
-from morgs_mi.capture.points import dense_points, match_capture
+from morgs_mi.capture.points import dense_points, match_capture, triangulate_points
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.extras import extra
@@ -22,12 +23,14 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.fit.budget import check_capacity
+from morgs_mi.loop.first_frame import preview
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.stream_header import about_lenses, as_fitted
 from morgs_mi.runs.fit_files import (
     FitFiles,
     Interrupted,
+    ProvisionalFrame,
     Recording,
     check_outputs,
     interrupted_fit,
@@ -45,15 +48,15 @@ class _FirstFrameProgress:
     """Report that also notes the progress of the first frame, which viewers show."""
 
     report: Report | None
-    seconds: float = 0.0  #: Since its first step.
-    share: float = 0.0  #: Of its steps.
-    begin: float | None = None
+    begin: float = field(default_factory=time.perf_counter)
+    first_step: float | None = None
+    left: float | None = None  #: Seconds of the steps that are left; None before the first one.
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         if stage.startswith("First frame"):
-            self.begin = self.begin or time.perf_counter()
-            self.seconds = time.perf_counter() - self.begin
-            self.share = done / total
+            moment = time.perf_counter()
+            self.first_step = self.first_step or moment
+            self.left = (moment - self.first_step) * (total - done) / done if done else None
         if self.report is not None:
             self.report(stage, done, total)
 
@@ -104,12 +107,26 @@ def stream_capture(
     )
     watched = _FirstFrameProgress(progress)
     stages = Progress(watched)
-    with locked_folder(out, "stream_capture()"):
+    with locked_folder(out, "stream_capture()"), ExitStack() as at_end:
         files = FitFiles.of(out)
-        metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
+        at_end.callback(files.provisional.unlink, missing_ok=True)
+        first_frame = next(capture.partial_frames(0, 1))
+        metadata = stream_metadata(capture, first_frame, config)
+        provisional = ProvisionalFrame(files.provisional, capture, metadata)
+
+        def show(keyframe: Packet) -> None:
+            seconds = time.perf_counter() - watched.begin
+            provisional.show(keyframe, {"seconds": seconds, "left": watched.left})
+            if on_provisional is not None:
+                on_provisional(keyframe)
+
+        def show_preview(sparse: Capture) -> None:
+            images = first_frame.comparable(sparse.train_views)
+            preview(StreamLoop.of(sparse, config).setup, images, show)
+
         earlier = interrupted_fit(files, capture, metadata) if resume else None
         if earlier is None:
-            prepared = Prepared.of(capture, config, stages)
+            prepared = Prepared.of(capture, config, stages, show_preview)
             loop = StreamLoop.of(prepared.capture, config)
             frames = prepared.capture.partial_frames()
         else:
@@ -120,13 +137,8 @@ def stream_capture(
         last = prepared.capture.num_frames - 1
         later_frames = stages.of("Later frames")
         metadata |= about_lenses(prepared.capture)
+        provisional.capture = prepared.capture
         with Recording(files, prepared.capture, metadata, earlier) as recording:
-
-            def show(keyframe: Packet) -> None:
-                recording.show(keyframe, {"seconds": watched.seconds, "share": watched.share})
-                if on_provisional is not None:
-                    on_provisional(keyframe)
-
             for frame, upcoming in with_next(frames):
                 stage = later_frames.part(frame.index - 1, last) if frame.index else stages
                 packet, report = push_frame(loop, frame, train, stage.report, upcoming, show)
@@ -171,11 +183,17 @@ class Prepared:
     ) = None
 
     @classmethod
-    def of(cls, capture: Capture, config: StreamConfig, progress: Progress) -> Prepared:
+    def of(
+        cls,
+        capture: Capture,
+        config: StreamConfig,
+        progress: Progress,
+        on_sparse: Callable[[Capture], None] | None = None,
+    ) -> Prepared:
         """Return a capture with triangulated points where it has few, and with refined cameras
-        where asked for.
+        where asked for; arguments as for `with_points`.
         """
-        capture = with_points(capture, config.seed, progress)
+        capture = with_points(capture, config.seed, progress, on_sparse)
         if config.fit.refine_cameras == "off":
             return cls(capture)
         stage = progress.of("Refining cameras")
@@ -217,15 +235,29 @@ def begin_as(source: Path, out: Path, capture: Capture, metadata: dict[str, Any]
         recording.extend([next(iter(stream))], read_reports(files.report, range(1)))
 
 
-def with_points(capture: Capture, seed: int, progress: Progress) -> Capture:
+def with_points(
+    capture: Capture,
+    seed: int,
+    progress: Progress,
+    on_sparse: Callable[[Capture], None] | None = None,
+) -> Capture:
     """Return a capture with the points of `dense_points` if it has few and they are more; see
     `stream_capture`.
+
+    Args:
+        capture: a capture.
+        seed: of the selection of points.
+        progress: of the stages.
+        on_sparse: called with the capture with triangulated points alone, if they are more.
     """
     if len(capture.points) >= _FEW_POINTS:
         return capture
     shared = match_capture(capture, progress.of("Matching views"))
+    sparse = triangulate_points(capture, shared)
+    if on_sparse is not None and len(sparse.points) > len(capture.points):
+        on_sparse(sparse)
     progress.of("Triangulating points")(0, 1)
-    return max(capture, dense_points(capture, shared, seed), key=lambda c: len(c.points))
+    return max(capture, dense_points(capture, sparse, seed), key=lambda c: len(c.points))
 
 
 def push_frame(

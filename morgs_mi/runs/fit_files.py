@@ -111,6 +111,44 @@ def check_outputs(out: Path) -> None:
         check_output(out / name)
 
 
+@dataclass(eq=False)
+class ProvisionalFrame:
+    """Provisional first frame beside a stream, which viewers show until the stream has its first
+    frame.
+    """
+
+    path: Path  #: File of the frame; one of an earlier fit is removed.
+    capture: Capture  #: Cameras and frame rate of the stream's header.
+    metadata: Mapping[str, Any]  #: Other entries of the header, from `stream_metadata`.
+    is_shown: bool = True  #: False after it could not be written.
+
+    def __post_init__(self) -> None:
+        self.path.unlink(missing_ok=True)
+
+    def show(self, keyframe: Packet, progress: Mapping[str, float | None]) -> None:
+        """Write a keyframe, with the progress of its fit in the header's metadata.
+
+        If it cannot be written, e.g. because the disk has room for the result alone, a warning is
+        logged, and it and later ones are skipped.
+        """
+        if not self.is_shown:
+            return
+        metadata = {**self.metadata, "provisional": progress}
+        try:
+            with (
+                atomic_path(self.path, "ProvisionalFrame.show()") as partial,
+                StreamWriter(partial, self.capture.cameras, self.capture.fps, metadata) as writer,
+            ):
+                writer.write(keyframe)
+        except OSError:
+            self.is_shown = False
+            _LOG.warning(
+                "%s: a provisional first frame cannot be written, perhaps for lack of room; the "
+                "fit goes on without it",
+                self.path,
+            )
+
+
 class Recording:
     """Stream and report of a fit, to which frames are added; a context manager.
 
@@ -138,11 +176,8 @@ class Recording:
     ) -> None:
         self._files = files
         self._metadata = metadata
-        self._capture = capture
         self._interval: int = metadata["config"]["codec"]["keyframe_interval"]
-        self._shows_provisional = True
         self.reports: list[FrameReport] = []
-        files.provisional.unlink(missing_ok=True)
         files.settle()
         self._written_files = files.next if earlier is None and files.stream.exists() else files
         if earlier is None:
@@ -167,38 +202,9 @@ class Recording:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._writer.close()
-        self._files.provisional.unlink(missing_ok=True)
         self._files.settle()
         if kind is None:
             self._check_in_place()
-
-    def show(self, keyframe: Packet, progress: Mapping[str, float] | None = None) -> None:
-        """Write a provisional first frame beside the stream, which viewers show until the stream
-        has its first frame, with the progress of its fit in the header's metadata.
-
-        If it cannot be written, e.g. because the disk has room for the result alone, a warning is
-        logged, and it and later ones are skipped.
-        """
-        if not self._shows_provisional:
-            return
-        try:
-            with (
-                atomic_path(self._files.provisional, "Recording.show()") as partial,
-                StreamWriter(
-                    partial,
-                    self._capture.cameras,
-                    self._capture.fps,
-                    {**self._metadata, "provisional": progress},
-                ) as writer,
-            ):
-                writer.write(keyframe)
-        except OSError:
-            self._shows_provisional = False
-            _LOG.warning(
-                "%s: a provisional first frame cannot be written, perhaps for lack of room; the "
-                "fit goes on without it",
-                self._files.provisional,
-            )
 
     def push(
         self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any

@@ -89,8 +89,8 @@ function unitOf(cameras: CameraFields[]): number {
 }
 
 interface Metadata {
-  /** Seconds since the first step of the first frame, and the share of its steps that is done. */
-  provisional?: { seconds: number; share: number };
+  /** Seconds since the fit began, and those of the steps of the first frame that are left; null before them. */
+  provisional?: { seconds: number; left: number | null };
   config?: { render?: object };
   motion_scale?: number;
   default_rig?: boolean;
@@ -212,9 +212,9 @@ class Player {
 
   /** Describe the provisional first frame, with the PSNR of the selected camera over the time of the fit. */
   private async describe(count: number): Promise<void> {
-    const { seconds, share } = (this.stream!.metadata as Metadata).provisional ?? { seconds: 0, share: 0 };
-    const left = share > 0 ? `, about ${Math.round((seconds * (1 - share)) / share)} s left` : "";
-    const text = `Provisional first frame: ${count} Gaussians after ${Math.round(seconds)} s${left}`;
+    const { seconds, left } = (this.stream!.metadata as Metadata).provisional ?? { seconds: 0, left: null };
+    const rest = left === null ? "" : `, about ${Math.round(left)} s left`;
+    const text = `Provisional first frame: ${count} Gaussians after ${Math.round(seconds)} s${rest}`;
     note("provisional", `${text}.`);
     if (!this.hasRecording) return;
     const value = await psnr(this.cameras[0], 0, this.frames[0]).catch(() => NaN);

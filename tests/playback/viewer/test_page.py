@@ -90,7 +90,7 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
             1,
             splats(30, seed=3),
             rig(WIDTH, HEIGHT),
-            {**open_stream(tmp_path).metadata, "provisional": {"seconds": 6.2, "share": 0.5}},
+            {**open_stream(tmp_path).metadata, "provisional": {"seconds": 6.2, "left": 6.1}},
         )
         page.page.get_by_text("first frame: 30 Gaussians after 6 s, about 6 s left.").wait_for()
         page.wait(READY)
