@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 
@@ -46,6 +47,12 @@ def test_info__describes_a_file_of_gaussians(tmp_path, capsys):
     assert "MB of memory" in output
     assert output.splitlines()[-1] == f"Next: morgs-mi view {file}"
     assert error == ""
+
+
+def test_info__finds_the_fit_in_a_folder(fitted_clip, tmp_path, capsys):
+    shutil.copytree(fitted_clip, tmp_path / "demo" / "stream")
+    assert main(["info", str(tmp_path / "demo")]) == 0
+    assert "stream.morgs: " in capsys.readouterr().out
 
 
 def test_commands__without_llvm_print_a_sentence():

@@ -85,7 +85,8 @@ class Info:
         if self.plot is not None:
             check_output(self.plot)
             check_plot(self.plot)
-        if self.capture.is_file() or (self.capture / STREAM).is_file():
+        fits = [self.capture / STREAM, *self.capture.glob(f"*/{STREAM}")]
+        if self.capture.is_file() or any(fit.is_file() for fit in fits):
             _print_stream(self.capture)
             return
         capture = load_capture(self.capture, reading=self.reading.read_config())
