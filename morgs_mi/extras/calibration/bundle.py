@@ -300,21 +300,15 @@ class NormalEquations:
         by_points = np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
         matrix = np.asarray(block_diag(*cameras)) - by_points
         right = right - np.einsum("pij,pj->i", solved, self._right_points)
-        step = _solved(matrix, -right, frame, -frame @ changes.ravel())
+        # The constraints as further rows; those of zeros are ignored.
+        scale = np.diag(matrix).mean()
+        lengths = np.maximum(np.linalg.norm(frame, axis=1), 1e-30) / scale
+        rows = frame / lengths[:, None]
+        value = -frame @ changes.ravel() / lengths
+        system = np.block([[matrix, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
+        step = np.linalg.solve(system, np.concatenate([-right, value]))[: right.size]
         rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
         return step.reshape(changes.shape), np.linalg.solve(points, rest[..., None])[..., 0]
-
-
-def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return the x that minimises x' A x / 2 - b' x with `rows` x = `value`; rows of zeros are
-    ignored.
-    """
-    scale = np.diag(A).mean()
-    lengths = np.maximum(np.linalg.norm(rows, axis=1), 1e-30) / scale
-    rows = rows / lengths[:, None]
-    value = value / lengths
-    system = np.block([[A, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
-    return np.linalg.solve(system, np.concatenate([b, value]))[: len(b)]
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:

@@ -207,9 +207,13 @@ def refine_cameras(
     calibrated = scores[0] if has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
     changes = estimates[best]
-    refinement = Refinement(
-        is_better, calibrated, scores[best], tracks, *_sizes(problem.cameras, changes)
-    )
+    shifts = []
+    for camera, change in zip(problem.cameras, changes, strict=True):
+        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * camera.size
+        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
+    vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
+    sizes = [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
+    refinement = Refinement(is_better, calibrated, scores[best], tracks, *sizes)
     return problem.changed_capture(changes) if is_better else capture, refinement
 
 
@@ -385,18 +389,6 @@ def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
             mask = valid
         changed_views.append(View(camera, image, mask))
     return changed_views
-
-
-def _sizes(cameras: Sequence[Camera], changes: np.ndarray) -> list[float]:
-    """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by
-    the lens.
-    """
-    shifts = []
-    for camera, change in zip(cameras, changes, strict=True):
-        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * camera.size
-        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
-    vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
-    return [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
