@@ -24,7 +24,6 @@ import numpy as np
 
 from morgs_mi.core.checks import require
 from morgs_mi.core.documentation import page
-from morgs_mi.core.types import Arrays
 from morgs_mi.extras.networks.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig, MaskRefiner
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask
@@ -103,38 +102,33 @@ class SegmentNetwork:
         features = self._encoder.run(
             {next(iter(self._encoder.inputs)): imagenet_blob(image, *self._size)}
         )
-        for label in order[: self._count]:
-            objects |= self._segment(features, labels == label)
-        return objects
-
-    def _segment(self, features: Arrays, component: np.ndarray) -> np.ndarray:
-        """Return the object [H, W] under one component: the decoder's mask with the highest
-        predicted IoU.
-        """
-        height, width = component.shape
+        height, width = mask.shape
         input_width, input_height = self._size
-        points, labels = prompts(component)
         # The decoder adds half a pixel: its pixel centres have whole coordinates.
         scale = np.array((input_width / width, input_height / height), np.float32)
         quarter = input_height // _MASK_SHRINK, input_width // _MASK_SHRINK
-        inputs = {
-            **features,
-            "point_coords": (points * scale - np.float32(0.5))[None],
-            "point_labels": labels[None],
-            "mask_input": np.zeros((1, 1, *quarter), np.float32),
-            "has_mask_input": np.zeros(1, np.float32),
-        }
-        results = self._decoder.run({name: inputs[name] for name in self._decoder.inputs})
-        masks, quality = (results[name] for name in _RESULTS)
-        require(
-            masks.ndim == 4 and quality.shape == masks.shape[:2] and len(masks) == 1,
-            self._decoder.path,
-            "expected masks [1, M, H, W] and iou_predictions [1, M]",
-            f"{list(masks.shape)} and {list(quality.shape)}",
-            "export the decoder again",
-        )
-        logits = masks[0, np.argmax(quality[0])].astype(np.float32)
-        return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
+        for label in order[: self._count]:
+            points, point_labels = prompts(labels == label)
+            inputs = {
+                **features,
+                "point_coords": (points * scale - np.float32(0.5))[None],
+                "point_labels": point_labels[None],
+                "mask_input": np.zeros((1, 1, *quarter), np.float32),
+                "has_mask_input": np.zeros(1, np.float32),
+            }
+            results = self._decoder.run({name: inputs[name] for name in self._decoder.inputs})
+            masks, quality = (results[name] for name in _RESULTS)
+            require(
+                masks.ndim == 4 and quality.shape == masks.shape[:2] and len(masks) == 1,
+                self._decoder.path,
+                "expected masks [1, M, H, W] and iou_predictions [1, M]",
+                f"{list(masks.shape)} and {list(quality.shape)}",
+                "export the decoder again",
+            )
+            # The mask with the highest predicted IoU.
+            logits = masks[0, np.argmax(quality[0])].astype(np.float32)
+            objects |= cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
+        return objects
 
 
 def prompts(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -183,43 +183,14 @@ def _mixed_seed(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
-def _record_light(
-    tracer: PathTracer,
-    camera: Camera,
-    disturbance: CameraDisturbance,
-    frame: int,
-    config: SynthConfig,
-) -> np.ndarray:
-    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear
-    [H, W, 3].
-
-    Args:
-        tracer: the scene; its time is changed.
-        camera: the view without distortion.
-        disturbance: of the camera.
-        frame: index of the frame.
-        config: samples per pixel, their seed and the frame rate.
-    """
-    assert config.spp is not None
-    if not disturbance.rolling_shutter and not disturbance.distortion:
-        tracer.set_time((frame + disturbance.time_offset) / config.fps)
-        return tracer.light(camera, config.spp, config.seed)
-    row_times = disturbance.row_times(frame, camera.height)
-    count = -(-camera.height // _BAND) if disturbance.rolling_shutter else 1
-    bands = []
-    for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
-        tracer.set_time(row_times[rows].mean() / config.fps)
-        seed = _mixed_seed(config.seed, band)
-        bands.append(tracer.light_of_rows(camera, rows, config.spp, seed, disturbance.lens))
-    return np.concatenate(bands)
-
-
 def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | None) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
     config = rig.config
     noise = config.noise
+    spp = config.spp
     assert noise is not None
-    count = itertools.count(1)
+    assert spp is not None
+    image_count = itertools.count(1)
 
     def images(index: int, camera: Camera) -> Iterator[np.ndarray]:
         for frame in range(config.frames):
@@ -227,10 +198,23 @@ def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | 
             # texture.
             seed = _mixed_seed(config.seed, index, frame)
             disturbance = rig.disturbed[index]
-            light = _record_light(tracer, camera, disturbance, frame, replace(config, seed=seed))
+            if not disturbance.rolling_shutter and not disturbance.distortion:
+                tracer.set_time((frame + disturbance.time_offset) / config.fps)
+                light = tracer.light(camera, spp, seed)
+            else:
+                row_times = disturbance.row_times(frame, camera.height)
+                count = -(-camera.height // _BAND) if disturbance.rolling_shutter else 1
+                bands = []
+                for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
+                    tracer.set_time(row_times[rows].mean() / config.fps)
+                    band_seed = _mixed_seed(seed, band)
+                    bands.append(
+                        tracer.light_of_rows(camera, rows, spp, band_seed, disturbance.lens)
+                    )
+                light = np.concatenate(bands)
             yield developed(light, noise, seed)
             if progress is not None:
-                progress(next(count), len(rig.cameras) * config.frames)
+                progress(next(image_count), len(rig.cameras) * config.frames)
 
     clips = []
     for index, camera in enumerate(rig.cameras):
