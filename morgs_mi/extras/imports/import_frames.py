@@ -184,17 +184,6 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
     return paths
 
 
-def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
-    """Return whether the rows of two frames are the same Gaussians, by centre, size, opacity and
-    base colour.
-    """
-    if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
-        return False
-    old, new = _scaled_features(before, now)
-    distances_to_next = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
-    return bool(np.mean(np.square(new - old).sum(axis=1) <= distances_to_next) >= _LEAST_SHARE)
-
-
 def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     """Return the row in the frame before of each Gaussian, -1 for births; None if the frames have
     other Gaussians.
@@ -206,12 +195,19 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     Returns:
         int64 [M]: ascending apart from the births.
     """
-    if same_gaussians(before, now):
-        return np.arange(len(now))
     fewer = min(len(before), len(now))
     if before.sh_degree != now.sh_degree or not fewer:
         return None
-    old, new = _scaled_features(before, now)
+    # In units of their spread in the frame before, without those that are equal there.
+    old = _features(before)
+    spread = old.std(axis=0)
+    old = old[:, spread > 0] / spread[spread > 0]
+    new = _features(now)[:, spread > 0] / spread[spread > 0]
+    if len(old) == len(new):
+        distances = np.square(new - old).sum(axis=1)
+        distances_to_next = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
+        if np.mean(distances <= distances_to_next) >= _LEAST_SHARE:
+            return np.arange(len(now))
     if not old.shape[1] or not np.isfinite(new).all():  # they cannot be compared
         return None
     # The search takes forever among many that are equal.
@@ -231,18 +227,6 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
         row, row_before = ends[k] + 1
         rows[row : row + gap[k] - 1] = np.arange(row_before, row_before + gap[k] - 1)
     return rows
-
-
-def _scaled_features(
-    old_gaussians: Gaussians, new_gaussians: Gaussians
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the features of two frames in units of their spread in the first, without those that
-    are equal there.
-    """
-    old = _features(old_gaussians)
-    new = _features(new_gaussians)
-    spread = old.std(axis=0)
-    return old[:, spread > 0] / spread[spread > 0], new[:, spread > 0] / spread[spread > 0]
 
 
 def _increasing(numbers: np.ndarray) -> np.ndarray:
