@@ -72,7 +72,7 @@ class Coder:
     def rounded(self, quantizer_step: int) -> np.ndarray:
         """Return the changes in whole steps, int32 [C, N]."""
         r = np.zeros((len(self.change), len(self.grid)), np.int32)
-        steps = self.change / _change_step(quantizer_step)
+        steps = self.change / step_sizes(np.array(quantizer_step))
         for name, at in self.grid.columns.items():
             threshold = _THRESHOLD_DC if name == "sh_dc" else _THRESHOLD
             steps[at, np.max(np.abs(steps[at]), axis=0) < threshold] = 0
@@ -106,7 +106,7 @@ def take_change(
     """
     values = grid.values.copy()
     dead = np.zeros(len(grid), bool)
-    step = _change_step(quantizer_step)
+    step = step_sizes(np.array(quantizer_step))
     bits = sum(1 << GROUPS.index(name) for name in grid.columns) // _DEAD
     for rows in _classes(grid):
         geometry = reader.take(len(rows))
@@ -139,11 +139,6 @@ def _classes(grid: Grid) -> list[np.ndarray]:
         np.zeros(len(grid), bool) if confidence is None else grid.values[:, confidence.start] > 0
     )
     return [np.flatnonzero(~moving), np.flatnonzero(moving)]
-
-
-def _change_step(quantizer_step: int) -> np.ndarray:
-    """Return the step of the changes in multiples of the grid's steps."""
-    return step_sizes(np.array(quantizer_step))
 
 
 # An entropy code stores a column of one value in almost no bytes. A small packet must not request

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from morgs_mi.core.camera import unit_vectors
 from morgs_mi.core.gaussians import Gaussians
 
 
@@ -34,8 +35,10 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the spherical harmonics of unit directions [M, 3] with 3DGS's signs, [M, K]."""
-    basis = [np.asarray(values) for values in dr.sh_eval(mi.Vector3f(directions.T), degree)]
-    return np.stack([np.broadcast_to(values, len(directions)) for values in basis], axis=1)
+    basis = dr.sh_eval(mi.Vector3f(directions.T), degree)
+    return np.stack(
+        [np.broadcast_to(np.asarray(values), len(directions)) for values in basis], axis=1
+    )
 
 
 def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
@@ -51,8 +54,7 @@ def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
     raw = gaussians.numpy()
     vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
     # More than twice as many directions as the 16 functions of degree 3.
-    directions = np.random.default_rng(0).normal(size=(40, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit_vectors(np.random.default_rng(0).normal(size=(40, 3)))
     basis, turned_basis = (sh_basis(d, gaussians.sh_degree) for d in (directions, directions @ R))
     coeffs = np.einsum("kl,nlc->nkc", np.linalg.pinv(basis) @ turned_basis, raw["sh_coeffs"])
     return replace(gaussians, quats=turns.as_quat(scalar_first=True), sh_coeffs=coeffs, **vectors)
