@@ -11,6 +11,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import drjit as dr
@@ -302,16 +303,28 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
         camera: the same camera.
         crop: pixels of the camera's image, (x, y, width, height), P in all.
     """
-    first, (across, down) = _rectangle(scene.bbox(), camera, crop)
     coverage = dr.zeros(mi.Float, crop[2] * crop[3])
     depth = dr.full(mi.Float, dr.inf, crop[2] * crop[3])
+    box = scene.bbox()
+    if not box.valid():  # no surface
+        return coverage, depth
+    # The part of the crop that the corners of the box may reach.
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    pixels, depths = camera.project(np.array(list(product(*ends.T))))
+    low = np.zeros(2)
+    high = np.array(crop[2:])
+    if (depths >= camera.near).all():
+        ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
+        low, high = np.clip(ends - crop[:2], 0, high)
+    first = low.astype(int).tolist()
+    across, down = (high - low).astype(int).tolist()
     if not across * down:
         return coverage, depth
     lane: UInt32 = dr.arange(mi.UInt32, across * down)
     columns: UInt32 = dr.opaque(mi.UInt32, across)
     row = lane // columns
     column = lane - row * columns
-    pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + column + int(first[0])
+    pixel = (row + first[1]) * dr.opaque(mi.UInt32, crop[2]) + column + first[0]
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
@@ -330,23 +343,6 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
     )
     dr.eval(coverage, depth)
     return coverage, depth
-
-
-def _rectangle(box: Any, camera: Camera, crop: Crop) -> tuple[np.ndarray, list[int]]:
-    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from
-    there, (x, y).
-    """
-    if not box.valid():  # no surface
-        return np.zeros(2, int), [0, 0]
-    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
-    corners = np.array([[x, y, z] for x in ends[:, 0] for y in ends[:, 1] for z in ends[:, 2]])
-    pixels, depth = camera.project(corners)
-    low = np.zeros(2)
-    high = np.array(crop[2:])
-    if (depth >= camera.near).all():
-        ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
-        low, high = np.clip(ends - crop[:2], 0, high)
-    return low.astype(int), (high - low).astype(int).tolist()
 
 
 def _environment(scene: Any, sensor: Any) -> Any:

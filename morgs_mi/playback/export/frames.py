@@ -49,13 +49,24 @@ def write_images(
         ValueError: another type of video.
         OSError: the folder exists, or a file cannot be written.
     """
-    kind = choose_format(IMAGES, output).name
-    frames = _display_frames(rendered, 0.0 if kind == "exr" else display_exposure, progress)
+    choice = choose_format(IMAGES, output)
+    kind = choice.name
+    exposure = 0.0 if kind == "exr" else display_exposure
+
+    def display_frames() -> Iterator[_Frame]:
+        for count, (frame, images) in enumerate(rendered, start=1):
+            if exposure and "color" in images:
+                images = {**images, "color": exposed(images["color"], exposure)}
+            yield frame, images
+            if progress is not None:
+                progress(count)
+
+    frames = display_frames()
     if kind == "mp4":
         movie = (pad_to_even(_combined_image(images)) for _, images in frames)
         write_video(output, movie, fps, PLAYABLE)
         return
-    is_file = Path(output).name.lower().endswith(f".{kind}")
+    is_file = choice.is_file(output)
     with (atomic_path if is_file else atomic_folder)(output, "write_images()") as partial:
         for count, (frame, images) in enumerate(frames):
             if is_file and count:
@@ -73,18 +84,6 @@ def write_images(
                 path.write_bytes(png_bytes(rgba))
             else:
                 write_png(path, _combined_image(images))
-
-
-def _display_frames(
-    rendered: Iterable[_Frame], exposure: float, progress: Callable[[int], None] | None
-) -> Iterator[_Frame]:
-    """Yield rendered frames with colours that are brightened by an exposure, in stops."""
-    for count, (frame, images) in enumerate(rendered, start=1):
-        if exposure and "color" in images:
-            images = {**images, "color": exposed(images["color"], exposure)}
-        yield frame, images
-        if progress is not None:
-            progress(count)
 
 
 def exr_channels(images: Arrays) -> Arrays:
