@@ -22,7 +22,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.layouts.calibration import (
-    Calibration,
     Reader,
     calibration_files,
     only_calibration,
@@ -155,10 +154,11 @@ def _calibration_files(path: Path) -> list[Path]:
     return files
 
 
-def _read_calibration(path: Path) -> Calibration:
-    return only_calibration(path, _calibration_files(path), "one calibration in TOML", read_anipose)
-
-
 READER = Reader(
-    "Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration
+    "Anipose",
+    ("calibration.toml",),
+    lambda path: bool(_calibration_files(path)),
+    lambda path: only_calibration(
+        path, _calibration_files(path), "one calibration in TOML", read_anipose
+    ),
 )
