@@ -80,16 +80,23 @@ def _patches_agree(
     pixels = np.concatenate(Match((0, 1), pairs).pixels((a, b)))
     points = intersect_pairs(pixels, (0, 1), (first, second))
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The patches of the first view as the second one sees them, on planes that face both.
-        rays = [points - camera.position for camera in (first, second)]
-        normals = sum(map(unit_vectors, rays))
-        edges = first.project(points)[0] + a.axes[pairs[:, 0]]
-        directions = first.unproject(edges, np.ones(len(points))) - first.position
-        scale = (rays[0] * normals).sum(axis=1) / (directions * normals).sum(axis=1)
-        ends = first.position + scale[:, None] * directions
-        expected = second.project(ends)[0] - second.project(points)[0]
+        expected = _carried(points, a.axes[pairs[:, 0]], first, second)
         axes = b.axes[pairs[:, 1]]
         expected_length, length = (np.linalg.norm(vectors, axis=1) for vectors in (expected, axes))
         octaves = np.log2(expected_length / length)
         cosines = (expected * axes).sum(axis=1) / expected_length / length
     return (np.abs(octaves) <= _MAX_OCTAVES) & (cosines >= np.cos(np.deg2rad(_MAX_TURN)))
+
+
+def _carried(points: np.ndarray, vectors: np.ndarray, first: Camera, second: Camera) -> np.ndarray:
+    """Return image vectors at points [M, 3] as another camera sees them [M, 2], on planes that face
+    both cameras.
+    """
+    rays = [points - camera.position for camera in (first, second)]
+    normals = sum(map(unit_vectors, rays))
+    directions = (
+        first.unproject(first.project(points)[0] + vectors, np.ones(len(points))) - first.position
+    )
+    scale = (rays[0] * normals).sum(axis=1) / (directions * normals).sum(axis=1)
+    ends = first.position + scale[:, None] * directions
+    return second.project(ends)[0] - second.project(points)[0]

@@ -48,13 +48,7 @@ def interrupts_raised() -> Iterator[None]:
     except BaseException as error:
         if not is_interruption(error):
             raise
-        collects = gc.isenabled()
-        gc.disable()
-        for link in _chain(error):
-            traceback.clear_frames(link.__traceback__)
-        gc.collect()
-        if collects:
-            gc.enable()
+        _release(error)
         if isinstance(error, KeyboardInterrupt):
             raise
         raise KeyboardInterrupt from None
@@ -149,6 +143,17 @@ def begin_command() -> None:
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
+
+
+def _release(error: BaseException) -> None:
+    """Release the variables of the functions that an error has left, in this thread alone."""
+    collects = gc.isenabled()
+    gc.disable()
+    for link in _chain(error):
+        traceback.clear_frames(link.__traceback__)
+    gc.collect()
+    if collects:
+        gc.enable()
 
 
 def _chain(error: BaseException) -> list[BaseException]:

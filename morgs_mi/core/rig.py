@@ -141,16 +141,7 @@ def with_near_planes(
     """
     if near is not None:
         return tuple(replace(camera, near=near) for camera in cameras)
-    # Depths within which each camera shares nothing with the others, by the rig alone.
-    positions = positions_of(cameras)
-    focus = focus_depths(cameras)
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    nearest = distances.min(axis=1)
-    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
-    # Cameras at one place are apart by rounding errors.
-    rounding = 1e-9 * np.abs(positions).max()
-    depths = np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
+    depths = _rig_depths(cameras)
     for i, camera in enumerate(cameras):
         _, _, z = seen_points(replace(camera, near=_IN_FRONT), points)
         if len(z) >= _RELIABLE_POINTS:
@@ -176,6 +167,21 @@ def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray)
         f"{cameras[0].near:g} world units where it is {depths[0]:.3g} away",
         "pass with_near_planes(cameras, points), or cameras with a smaller `near`",
     )
+
+
+def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
+    0 if unknown.
+    """
+    positions = positions_of(cameras)
+    focus = focus_depths(cameras)
+    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    nearest = distances.min(axis=1)
+    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
+    # Cameras at one place are apart by rounding errors.
+    rounding = 1e-9 * np.abs(positions).max()
+    return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
 
 
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:

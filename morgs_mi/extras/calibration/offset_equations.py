@@ -101,16 +101,19 @@ class OffsetEquations:
         scale = self.own.mean() or 1.0
         diagonal = np.diag(self.matrix) + _FLOOR * scale
         whole = np.zeros_like(self.matrix)
-        # The inverse of the damped matrix among vectors with a mean of zero.
-        matrix = self.matrix[block]
-        centred = np.eye(len(matrix)) - 1 / len(matrix)
-        values, vectors = np.linalg.eigh(centred @ matrix @ centred)
-        inverse = (vectors / (np.maximum(values, 0) + damping * scale)) @ vectors.T
-        whole[block] = centred @ inverse @ centred / share
+        whole[block] = _centred_inverse(self.matrix[block], damping * scale) / share
         for view in np.flatnonzero(~train):
             unit = np.eye(len(train))[view]
             whole[view] = (unit - self.matrix[view, train] @ whole[train]) / diagonal[view]
         return whole
+
+
+def _centred_inverse(matrix: np.ndarray, damping: float) -> np.ndarray:
+    """Return the inverse of a damped matrix [n, n] among vectors with a mean of zero."""
+    centred = np.eye(len(matrix)) - 1 / len(matrix)
+    values, vectors = np.linalg.eigh(centred @ matrix @ centred)
+    inverse = (vectors / (np.maximum(values, 0) + damping)) @ vectors.T
+    return centred @ inverse @ centred
 
 
 def offset_equations(
