@@ -81,6 +81,19 @@ def opencv_lens(coefficients: Sequence[float]) -> Lens:
     return Lens("OPENCV", values[:4])
 
 
+def undistorted(camera: Camera, lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Return the pixels [P, 2] of the pinhole `camera` that `lens`, which is no fisheye, shows at
+    `pixels` [P, 2].
+    """
+    if not any(lens.distortion) or not len(pixels):
+        return pixels
+    precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
+    points = np.ascontiguousarray(pixels[:, None], np.float64)
+    return cv2.undistortPoints(
+        points, camera.K, lens.opencv_coefficients, None, np.eye(3), camera.K, precise
+    )[:, 0]
+
+
 @dataclass(frozen=True)
 class Undistortion:
     """Pixel maps that remove the distortion of one lens."""

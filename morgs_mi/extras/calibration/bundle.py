@@ -168,18 +168,6 @@ def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.
     return pixels + from_centre * (distortion[0] + distortion[1] * square) * square
 
 
-def undistorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Return the pixels [n, 2] of a pinhole camera that radial distortion k [2] shows at `pixels`
-    [n, 2].
-    """
-    if not np.any(distortion) or not len(pixels):
-        return pixels
-    coefficients = np.array([*distortion, 0, 0], np.float64)
-    return cv2.undistortPoints(
-        pixels[:, None].astype(np.float64), camera.K, coefficients, P=camera.K
-    )[:, 0]
-
-
 def camera_jacobian(
     camera: Camera, factor: float, points: np.ndarray, distortion: ArrayLike = (0, 0)
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -300,15 +288,21 @@ class NormalEquations:
         by_points = np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
         matrix = np.asarray(block_diag(*cameras)) - by_points
         right = right - np.einsum("pij,pj->i", solved, self._right_points)
-        # The constraints as further rows; those of zeros are ignored.
-        scale = np.diag(matrix).mean()
-        lengths = np.maximum(np.linalg.norm(frame, axis=1), 1e-30) / scale
-        rows = frame / lengths[:, None]
-        value = -frame @ changes.ravel() / lengths
-        system = np.block([[matrix, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
-        step = np.linalg.solve(system, np.concatenate([-right, value]))[: right.size]
+        step = _solved(matrix, -right, frame, -frame @ changes.ravel())
         rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
         return step.reshape(changes.shape), np.linalg.solve(points, rest[..., None])[..., 0]
+
+
+def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return the x that minimises x' A x / 2 - b' x with `rows` x = `value`; rows of zeros are
+    ignored.
+    """
+    scale = np.diag(A).mean()
+    lengths = np.maximum(np.linalg.norm(rows, axis=1), 1e-30) / scale
+    rows = rows / lengths[:, None]
+    value = value / lengths
+    system = np.block([[A, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
+    return np.linalg.solve(system, np.concatenate([b, value]))[: len(b)]
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:

@@ -36,7 +36,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.features import detect, intersect, join_matches, match_views
-from morgs_mi.capture.lens import Lens, undistortion
+from morgs_mi.capture.lens import Lens, undistorted, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
 from morgs_mi.core.gaussians import Gaussians
@@ -52,7 +52,6 @@ from morgs_mi.extras.calibration.bundle import (
     distorted,
     likely_deviations,
     prior_deviations,
-    undistorted,
 )
 from morgs_mi.extras.calibration.offset_equations import (
     blurred,
@@ -214,7 +213,16 @@ def refine_cameras(
     vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
     sizes = [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
     refinement = Refinement(is_better, calibrated, scores[best], tracks, *sizes)
-    return problem.changed_capture(changes) if is_better else capture, refinement
+    if not is_better:
+        return capture, refinement
+    cameras = list(capture.cameras)
+    distortions = np.zeros((len(cameras), 2))
+    for v, change in zip(problem.indices, changes, strict=True):
+        cameras[v] = changed_camera(cameras[v], change)
+        distortions[v] = change[9:]
+    rig = capture.with_cameras(cameras, distortions.tolist())
+    points = _moved(capture.points, problem.cameras, changes)
+    return replace(rig, points=points), refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,16 +296,6 @@ class _Problem:
             views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
             scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
         return scores
-
-    def changed_capture(self, changes: np.ndarray) -> Capture:
-        """Return the capture with changed cameras and moved points."""
-        cameras = list(self.capture.cameras)
-        distortions = np.zeros((len(cameras), 2))
-        for v, change in zip(self.indices, changes, strict=True):
-            cameras[v] = changed_camera(cameras[v], change)
-            distortions[v] = change[9:]
-        rig = self.capture.with_cameras(cameras, distortions.tolist())
-        return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
         """Return the problem of a short fit with changed cameras."""
@@ -397,7 +395,8 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     """
     rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     masks, pixels, _ = zip(*(seen_points(camera, points) for camera in cameras), strict=True)
-    pixels = map(undistorted, rig, pixels, changes[:, 9:])
+    lenses = (Lens("RADIAL", tuple(terms)) for terms in changes[:, 9:])
+    pixels = map(undistorted, rig, lenses, pixels)
     views, ids = np.nonzero(masks)
     intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
     is_determined = (np.sum(masks, axis=0) >= 2) & np.isfinite(intersections).all(axis=1)

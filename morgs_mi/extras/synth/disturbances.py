@@ -15,13 +15,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 from annotated_types import Ge, Le
 
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.config import NonNegative, check_ranges
 from morgs_mi.core.files import write_json
 
@@ -86,19 +84,6 @@ def draw_disturbances(
     offsets[0] = 0
     pairs = zip(offsets.tolist(), ks.tolist(), strict=True)
     return tuple(CameraDisturbance(offset, float(d.rolling_shutter), k) for offset, k in pairs)
-
-
-def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:
-    """Return the pixels of the pinhole `camera` that `lens` shows at `pixels` [P, 2], float64
-    [P, 2].
-    """
-    if lens is None or not any(lens.distortion):
-        return pixels
-    precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-    points = np.ascontiguousarray(pixels[:, None], np.float64)
-    return cv2.undistortPoints(
-        points, camera.K, lens.opencv_coefficients, None, np.eye(3), camera.K, precise
-    )[:, 0]
 
 
 def save_disturbances(folder: Path, cameras: Mapping[str, CameraDisturbance]) -> None:

@@ -9,12 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.capture.lens import Lens
+from morgs_mi.capture.lens import Lens, undistorted
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.core.rig import in_image
-from morgs_mi.extras.synth.disturbances import undistorted
 from morgs_mi.extras.synth.ground_truth import SurfacePoints
 from morgs_mi.extras.synth.scene import Pose, Scene
 
@@ -158,7 +157,7 @@ class PathTracer:
         return self._exposure * np.array(linear)[..., :3]
 
     def light_of_rows(
-        self, camera: Camera, rows: np.ndarray, spp: int, seed: int, lens: Lens | None
+        self, camera: Camera, rows: np.ndarray, spp: int, seed: int, lens: Lens
     ) -> np.ndarray:
         """Return the exposed light of some rows of an image that a lens has distorted, linear
         [R, W, 3].
@@ -168,7 +167,7 @@ class PathTracer:
             rows: indices of the rows [R].
             spp: samples per pixel.
             seed: seed of the samples.
-            lens: the distortion; None for a pinhole.
+            lens: the distortion.
         """
         # All samples of the pixels at once.
         sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})

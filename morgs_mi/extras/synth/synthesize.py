@@ -274,18 +274,18 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
             truth = compute_ground_truth(camera, surface, poses, old_poses, next_poses)
             save_truth(folder, camera.name, frame, truth)
             old_poses = poses
-    rng = np.random.default_rng([rig.config.seed, 1])
-    save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
+    save_tracks(folder, _sample_tracks(tracer, rig))
     save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
 
 
-def _sample_tracks(
-    tracer: PathTracer, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator
-) -> Tracks:
+def _sample_tracks(tracer: PathTracer, rig: _Rig) -> Tracks:
     """Return the tracks of surface points that are visible in the first, middle or last frame.
 
     Half of the points lie on moving objects.
     """
+    cameras = rig.cameras
+    times = np.arange(rig.config.frames) / rig.config.fps
+    rng = np.random.default_rng([rig.config.seed, 1])
     starts = sorted({0, len(times) // 2, len(times) - 1})
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points = []

@@ -4,14 +4,11 @@ states.
 
 from dataclasses import fields, replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi import Camera
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.extras.synth.disturbances import (
@@ -20,7 +17,6 @@ from morgs_mi.extras.synth.disturbances import (
     draw_disturbances,
     load_disturbances,
     save_disturbances,
-    undistorted,
 )
 from morgs_mi.extras.synth.path_tracer import PathTracer
 from morgs_mi.extras.synth.scene import Light, Object, Rig, Scene, load_scene, translate
@@ -79,17 +75,6 @@ def test_load_disturbances__names_a_missing_or_broken_file(tmp_path):
             ValueError, match="expected the disturbances of each camera, got a broken file"
         ):
             load_disturbances(tmp_path)
-
-
-@pytest.mark.parametrize("k", [-0.3, 0.4])
-def test_undistorted__is_the_inverse_of_the_lens(k):
-    camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 50, 64, 48)
-    pixels = np.random.default_rng(0).uniform(0, (64, 48), (50, 2))
-    there = undistorted(camera, Lens("SIMPLE_RADIAL", (k,)), pixels)
-    rays = camera.unproject(there, np.ones(50))
-    back, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, np.array([k, 0, 0, 0.0]))
-    assert_close(back[:, 0], pixels, atol=1e-6)
-    assert np.abs(there - pixels).max() > 0.5
 
 
 @pytest.mark.slow
