@@ -39,7 +39,13 @@ from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.stream_header import about_lenses
 from morgs_mi.runs.fit_capture import Prepared, push_frame
-from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
+from morgs_mi.runs.fit_files import (
+    FitFiles,
+    ProvisionalFrame,
+    Recording,
+    check_outputs,
+    stream_metadata,
+)
 from morgs_mi.stream_loop import StreamLoop
 
 _LOG = logging.getLogger(__name__)
@@ -84,6 +90,7 @@ def fit_live(
 
     Raises:
         FileExistsError: OUT has the capture of an earlier fit.
+        FileNotFoundError: the capture with the calibration is missing.
         OSError: a source cannot be opened, or the output cannot be written; the stream ends with a
             complete frame.
         ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be
@@ -99,7 +106,18 @@ def fit_live(
             f"{folder}: expected no capture, got that of an earlier fit; choose another "
             "folder for this one."
         )
-    calibration = None if live.calibration is None else read_calibration(live)
+    calibration = None
+    source = live.calibration
+    if source is not None:
+        if not source.is_dir():
+            raise FileNotFoundError(
+                f"{source}: expected a calibrated capture of the cameras, found none; check the "
+                "path."
+            )
+        calibration = find_reader(source).read(source)
+        if any(calibration.masks):
+            _LOG.warning("%s: its masks are not used by a live fit.", source)
+        calibration = calibration.without(source, live.without)
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
@@ -112,23 +130,6 @@ def fit_live(
         return _fit(
             _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
         )
-
-
-def read_calibration(config: LiveConfig) -> Calibration:
-    """Return the cameras of an earlier capture of the same rig.
-
-    Raises:
-        FileNotFoundError, ValueError: it is missing or broken.
-    """
-    folder = config.calibration
-    if folder is None or not folder.is_dir():
-        raise FileNotFoundError(
-            f"{folder}: expected a calibrated capture of the cameras, found none; check the path."
-        )
-    calibration = find_reader(folder).read(folder)
-    if any(calibration.masks):
-        _LOG.warning("%s: its masks are not used by a live fit.", folder)
-    return calibration.without(folder, config.without)
 
 
 def begin_capture(
@@ -277,12 +278,16 @@ def _fit(
     loop = StreamLoop.of(prepared.capture, config)
     rows: list[LiveFrame] = []
     metadata |= about_lenses(prepared.capture)
-    with Recording(FitFiles.of(out), prepared.capture, metadata) as recording:
+    files = FitFiles.of(out)
+    provisional = ProvisionalFrame(files.provisional, prepared.capture, metadata)
+    # Viewers see no progress of it.
+    show = partial(provisional.show, progress={"seconds": 0.0, "share": 0.0})
+    with Recording(files, prepared.capture, metadata) as recording:
         try:
             for frame_set, frame in frames:
                 writing_task = in_background(partial(_record, frames, out, frame_set, frame))
                 packet, report = push_frame(
-                    loop, frame, train, None if rows else on_stage, None, recording.show
+                    loop, frame, train, None if rows else on_stage, None, show
                 )
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 writing_task.result()
@@ -306,6 +311,8 @@ def _fit(
             if rows:
                 error.add_note(f"{out / 'stream.morgs'} ends with frame {rows[-1].frame}.")
             raise
+        finally:
+            files.provisional.unlink(missing_ok=True)
     return rows
 
 
