@@ -7,7 +7,7 @@ from __future__ import annotations
 import atexit
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from threading import Condition, Event, Thread
 
@@ -155,8 +155,17 @@ class CameraFeed:
             for k, camera in enumerate(self._cameras):
                 is_awaited = not late and camera.reason is None
                 expected[k] = expected[k] or bool(new[k]) if is_awaited else recent[k]
-        shots = _nearest(new, expected)
-        if shots is None:
+        groups = [shots for shots, is_expected in zip(new, expected, strict=True) if is_expected]
+        if not groups or not all(groups):
+            return None
+        time_of_slowest = min(shots[-1].time for shots in groups)
+        shots = [
+            min(shots, key=lambda shot: abs(shot.time - time_of_slowest)) if is_expected else None
+            for shots, is_expected in zip(new, expected, strict=True)
+        ]
+        times = [shot.time for shot in shots if shot is not None]
+        skew = max(times) - min(times)
+        if skew > _MAX_SKEW:
             return None
         pairs = zip(shots, self._cameras, strict=True)
         skipped = [
@@ -167,8 +176,8 @@ class CameraFeed:
         return FrameSet(
             tuple(shot and shot.image for shot in shots),
             tuple((shot or camera.shots[-1]).number for shot, camera in pairs),
-            max(shot.time for shot in shots if shot is not None),
-            _skew(shots),
+            max(times),
+            skew,
             0 if after is None else min(skipped),
         )
 
@@ -236,24 +245,3 @@ class _Camera(Thread):
             with self._change:
                 self.reason = str(self.error or self._end_text)
                 self._change.notify_all()
-
-
-def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Shot | None] | None:
-    """Return a shot of each expected camera, all within `_MAX_SKEW`; None if one has none yet, or
-    none is expected.
-    """
-    groups = [shots for shots, is_expected in zip(new, expected, strict=True) if is_expected]
-    if not groups or not all(groups):
-        return None
-    time_of_slowest = min(shots[-1].time for shots in groups)
-    choice = [
-        min(shots, key=lambda shot: abs(shot.time - time_of_slowest)) if is_expected else None
-        for shots, is_expected in zip(new, expected, strict=True)
-    ]
-    return choice if _skew(choice) <= _MAX_SKEW else None
-
-
-def _skew(shots: Sequence[Shot | None]) -> float:
-    """Return the largest difference in time between two shots, s."""
-    times = [shot.time for shot in shots if shot is not None]
-    return max(times) - min(times)

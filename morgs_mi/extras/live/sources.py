@@ -161,7 +161,7 @@ def live_frames(
 
 
 def read_camera(
-    source: int | str | Path,
+    source: Source,
     closed: Event,
     size: tuple[int, int] | None = None,
     reconnect: bool = True,
@@ -186,7 +186,7 @@ def read_camera(
 
 
 def _until_end(
-    source: int | str | Path, stop: Event, size: tuple[int, int] | None
+    source: Source, stop: Event, size: tuple[int, int] | None
 ) -> Iterator[np.ndarray | None]:
     """Yield the images of a source, which is opened once, until several reads in succession have
     failed; see `read_camera`.
