@@ -441,7 +441,10 @@ def _at_clip_sizes(
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
             "intrinsics are scaled.",
-            *(path, few([c.name for c in scaled]), scaled[0].width, scaled[0].height),
+            path,
+            few([c.name for c in scaled]),
+            scaled[0].width,
+            scaled[0].height,
         )
     return recorded
 

@@ -138,7 +138,7 @@ def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list
     neighbours = count if count <= _ALL_PAIRS else _NEIGHBOURS
     positions = positions_of(cameras)
     distances = np.linalg.norm(positions[:, None] - positions, axis=2)
-    ranks = distances.argsort(axis=1).argsort(axis=1)
+    ranks = distances.argsort().argsort()
     matches = []
     for i, j in combinations(range(count), 2):
         a = features[i]

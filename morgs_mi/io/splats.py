@@ -56,7 +56,10 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     if len(zero):
         _log.warning(
             "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
-            *(path, len(zero), N, few(zero, _MOST_NAMED)),
+            path,
+            len(zero),
+            N,
+            few(zero, _MOST_NAMED),
         )
     every = np.ones(N, bool)
     faults = []
@@ -77,7 +80,8 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
                 "%s: the centres, around (%g, %g, %g), are so far from 0 that float32 rounds them "
                 "by a tenth of the Gaussians' sizes or more; subtract an origin before they are "
                 "exported.",
-                *(path, *middle),
+                path,
+                *middle,
             )
     if not count:
         return gaussians
@@ -90,7 +94,11 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         )
     _log.warning(
         "%s: %d of %d Gaussians are left out, whose numbers are not finite or above %g: %s.",
-        *(path, count, N, LARGEST, details),
+        path,
+        count,
+        N,
+        LARGEST,
+        details,
     )
     return gaussians.select(every)
 
@@ -111,8 +119,7 @@ _RECORD = np.dtype(
 
 def suffix_of(path: str | Path) -> str | None:
     """Return the suffix of a file out of `SUFFIXES`, in any case of letters, or None."""
-    name = Path(path).name.lower()
-    return next(filter(name.endswith, SUFFIXES), None)
+    return next(filter(Path(path).name.lower().endswith, SUFFIXES), None)
 
 
 def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:

@@ -440,7 +440,9 @@ def _with_white(readers: list[FrameReader]) -> list[FrameReader]:
     white = 2 ** bits[0] - 1
     _LOG.warning(
         "%s and are read as %d bits; if white is %d, convert them to 8 bits.",
-        *(place, bits[0], _WHITE),
+        place,
+        bits[0],
+        _WHITE,
     )
     return [replace(r, white=white) if isinstance(r, FolderReader) else r for r in readers]
 

@@ -83,7 +83,8 @@ class Calibration:
         _LOG.warning(
             "%s: its cameras are too far from 0 for float32; coordinates are relative to the origin"
             " (%.10g, %.10g, %.10g)%s.",
-            *(path, *origin),
+            path,
+            *origin,
             f", and its points, which are rounded to {rounding:g}, are not used" if coarse else "",
         )
         return replace(result, points=NO_POINTS, point_colors=NO_POINTS) if coarse else result

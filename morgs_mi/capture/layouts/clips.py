@@ -279,7 +279,10 @@ def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]
             first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
             _LOG.warning(
                 "%s: %s have two clips, such as %s and %s: the latter is used.",
-                *(path, ", ".join(repeats), first, last),
+                path,
+                ", ".join(repeats),
+                first,
+                last,
             )
         result |= clips
     return result

@@ -210,7 +210,11 @@ def _read_calibration(path: Path) -> Calibration:
         counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
         _LOG.warning(
             "%s: the largest of %d models, %s with %d images, is used; %s.",
-            *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
+            folder.parent,
+            1 + len(others),
+            folder.name,
+            count_images(folder),
+            counts,
         )
     model = read_colmap(folder)
     calibration, _ = match_clips(path, folder, clips, model.cameras, model.lenses)

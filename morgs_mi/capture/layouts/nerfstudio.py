@@ -272,7 +272,10 @@ def _images_named(
         if unknown:
             _LOG.warning(
                 "%s: `%s` names %d images without a frame, such as %s.",
-                *(source, split, len(unknown), unknown[0]),
+                source,
+                split,
+                len(unknown),
+                unknown[0],
             )
     return images
 
