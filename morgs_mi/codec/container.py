@@ -77,8 +77,15 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     Raises:
         ValueError: JSON cannot represent it, or a reader would refuse it.
     """
+    views = []
+    for camera in cameras:
+        view = {key: getattr(camera, key) for key in _CAMERA}
+        if camera.background is not None:
+            image = png_bytes(byte_values(camera.background))
+            view["background"] = base64.b64encode(image).decode()
+        views.append(view)
     fields = {
-        "cameras": [_fields_of(camera) for camera in cameras],
+        "cameras": views,
         "fps": float(fps),
         "metadata": dict(metadata),
     }
@@ -90,15 +97,6 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"StreamWriter(): a reader would refuse the header: {error}.") from None
     return text
-
-
-def _fields_of(camera: Camera) -> dict[str, Any]:
-    """Return the JSON object of a camera in a header."""
-    fields = {key: getattr(camera, key) for key in _CAMERA}
-    if camera.background is not None:
-        image = png_bytes(byte_values(camera.background))
-        fields["background"] = base64.b64encode(image).decode()
-    return fields
 
 
 def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
@@ -226,6 +224,8 @@ class PacketKind(IntEnum):
     INDEX = 3
 
 
+Entry = tuple[int, int, int]
+"""(kind, frame, offset) of a packet."""
 _KINDS = (PacketKind.KEYFRAME, PacketKind.RESIDUAL)  # of frames
 
 
@@ -337,7 +337,7 @@ class StreamWriter:
     ) -> None:
         payload = header_json(cameras, fps, metadata or {}).encode()
         self.num_bytes = 0
-        self._index: list[tuple[int, int, int]] | None = []
+        self._index: list[Entry] | None = []
         is_path = isinstance(sink, str | Path)
         self._owns_file = is_path
         self.path = Path(sink if is_path else str(getattr(sink, "name", "stream")))
@@ -351,9 +351,7 @@ class StreamWriter:
             raise
 
     @classmethod
-    def continued(
-        cls, path: str | Path, index: Sequence[tuple[int, int, int]], end: int
-    ) -> StreamWriter:
+    def continued(cls, path: str | Path, index: Sequence[Entry], end: int) -> StreamWriter:
         """Return the writer of an interrupted stream; the file is truncated at byte `end`.
 
         Args:

@@ -19,6 +19,7 @@ from morgs_mi.codec.container import (
     PREAMBLE,
     TRAILER,
     VERSION,
+    Entry,
     Packet,
     PacketKind,
     TruncatedStreamError,
@@ -31,9 +32,6 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.core.bounded import open_regular
 
 _READ_SIZE = 2**20
-
-Entry = tuple[int, int, int]
-"""(kind, frame, offset) of a packet."""
 
 
 class StreamReader(FrameSource):
