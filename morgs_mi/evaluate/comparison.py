@@ -22,6 +22,9 @@ from morgs_mi.playback.stream_header import open_stream_capture, render_config, 
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.render_config import RenderConfig
 
+# Images of all views [H, W, 3]; None: missing.
+_Images = Sequence[np.ndarray | None]
+
 
 @dataclass(frozen=True, eq=False)
 class ComparedClip:
@@ -84,10 +87,10 @@ class ComparedFrame:
     kind: PacketKind  #: Kind of the frame's packet.
     num_bytes: int  #: Its size.
     #: Recorded images of all views, as a display shows them; None: missing.
-    images: Sequence[np.ndarray | None]
+    images: _Images
     #: Likewise of the frame before; None in the first one.
-    last: Sequence[np.ndarray | None] | None
-    recorded: Sequence[np.ndarray | None]  #: The images as they were recorded.
+    last: _Images | None
+    recorded: _Images  #: The images as they were recorded.
 
     def views(self) -> Iterator[ComparedView]:
         """Render and yield the evaluated views, except those without an image."""

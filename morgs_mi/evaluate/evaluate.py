@@ -4,9 +4,9 @@ list of measures.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import ChainMap
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def evaluate_stream(
                 f"other images in frame {index}; pass that capture (--capture), or compare with "
                 "any recording (--any-recording)."
             )
-        scores = _merged(measure.add_frame(frame) for measure in measures)
+        scores = ChainMap(*(measure.add_frame(frame) for measure in measures))
         rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds, **scores))
         if progress is not None:
             progress(len(rows), len(clip.packets))
@@ -107,13 +107,8 @@ def evaluate_stream(
             **playback_speed(stream, stream.cameras[clip.views[0]], clip.render)
         ),
         frames=tuple(rows),
-        **_merged(measure.result() for measure in measures),
+        **ChainMap(*(measure.result() for measure in measures)),
     )
-
-
-def _merged(fields: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """Return the fields of several measures together."""
-    return {name: value for each in fields for name, value in each.items()}
 
 
 def _fitted(stream: Path) -> dict[int, tuple[float | None, int, Sequence[str]]]:

@@ -12,12 +12,26 @@ from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.results import Evaluation
 
 # Title, name of the score and decimals.
-_METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("dE2000", "delta_e", 2))
-_METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
-_FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4))
-_FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
-_VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
-_VIEW += (("flow error", "motion_error", 2),)
+_METRICS = (
+    ("PSNR, dB", "psnr", 2),
+    ("SSIM", "ssim", 4),
+    ("dE2000", "delta_e", 2),
+    ("LPIPS", "lpips", 4),
+    ("flow error, px", "motion_error", 2),
+)
+_FRAME = (
+    ("PSNR, dB", "psnr", 2),
+    ("moving", "psnr_moving", 2),
+    ("SSIM", "ssim", 4),
+    ("flow error", "motion_error", 2),
+    ("moving", "motion_error_moving", 2),
+)
+_VIEW = (
+    ("PSNR, dB", "psnr", 2),
+    ("colours matched", "psnr_matched", 2),
+    ("SSIM", "ssim", 4),
+    ("flow error", "motion_error", 2),
+)
 
 
 def figure(value: float | None, digits: int) -> str:
