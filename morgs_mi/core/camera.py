@@ -152,7 +152,7 @@ class Camera:
             "tilt it",
         )
         forward = forward / distance
-        right = right / np.linalg.norm(right)
+        right = unit_vectors(right)
         viewmat = pose_at(np.stack([right, np.cross(forward, right), forward]), origin)
         K = intrinsics_of_fov(fov_x, width, height)
         return cls(K, viewmat, width, height, name, near=min(0.01, float(distance) / 100))

@@ -27,13 +27,12 @@ CAPTURE = "capture.json"
 """The path of the capture and how it was read; in a capture, its settings."""
 
 
+FilePath = str | os.PathLike[str]
 _LOCK = ".morgs-lock"
 
 
 @contextmanager
-def atomic_path(
-    path: str | os.PathLike[str], place: str, parents: bool = False
-) -> Generator[Path, None, None]:
+def atomic_path(path: FilePath, place: str, parents: bool = False) -> Generator[Path, None, None]:
     """Yield a path in the same folder for a file or folder, which is renamed to `path` when the
     body succeeds.
 
@@ -82,7 +81,7 @@ def _hidden(path: Path, use: str, process: object) -> Path:
 
 
 @contextmanager
-def atomic_folder(path: str | os.PathLike[str], place: str) -> Generator[Path, None, None]:
+def atomic_folder(path: FilePath, place: str) -> Generator[Path, None, None]:
     """Create a folder and its parents under another name, which is renamed to `path` as by
     `atomic_path`.
 
@@ -100,7 +99,7 @@ def atomic_folder(path: str | os.PathLike[str], place: str) -> Generator[Path, N
 
 
 @contextmanager
-def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, None, None]:
+def locked_folder(path: FilePath, place: str) -> Generator[None, None, None]:
     """Create a folder with its parents if it is missing, and lock it against other writers while
     the body runs.
 
@@ -135,7 +134,7 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         yield
 
 
-def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:
+def is_same_file(path: FilePath, status: os.stat_result) -> bool:
     """Return whether `path` still is the file that was opened: it was not removed, moved or
     replaced since.
     """
@@ -145,7 +144,7 @@ def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:
         return False
 
 
-def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
+def write_json(path: FilePath, value: Mapping[str, Any]) -> None:
     """Write `value` as JSON atomically, with null for floats that are not finite; missing folders
     are created.
 

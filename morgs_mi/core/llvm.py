@@ -46,11 +46,17 @@ def llvm_major(path: Path) -> int | None:
 def search_folders() -> list[Path]:
     """Return the folders where distributions, LLVM's own packages and conda install libLLVM."""
     prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix, sys.base_prefix]
-    folders = [Path(p, "lib") for p in prefixes if p]
-    folders += [Path(p) for p in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if p]
-    folders += [Path("/usr/lib64"), Path("/usr/local/lib"), Path("/usr/lib")]
+    paths = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
     usr = Path("/usr/lib")
-    return [*folders, usr / f"{os.uname().machine}-linux-gnu", *sorted(usr.glob("llvm-*/lib"))]
+    return [
+        *(Path(p, "lib") for p in prefixes if p),
+        *(Path(p) for p in paths if p),
+        Path("/usr/lib64"),
+        Path("/usr/local/lib"),
+        usr,
+        usr / f"{os.uname().machine}-linux-gnu",
+        *sorted(usr.glob("llvm-*/lib")),
+    ]
 
 
 def find_llvm() -> list[Path]:

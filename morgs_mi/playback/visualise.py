@@ -6,14 +6,13 @@ All images that are returned are uint8 RGB [H, W, 3].
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.files import atomic_path
+from morgs_mi.core.files import FilePath, atomic_path
 from morgs_mi.core.png import png_bytes
 
 GAP = 4
@@ -131,8 +130,7 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
     thickness = 2 if scale > 0.8 else 1
     (width, height), base = cv2.getTextSize(text, _FONT, scale, thickness)
     image[: height + base + 4, : width + 8] //= 4
-    white = (255, 255, 255)
-    cv2.putText(image, text, (4, height + 3), _FONT, scale, white, thickness, cv2.LINE_AA)
+    cv2.putText(image, text, (4, height + 3), _FONT, scale, (255, 255, 255), thickness, cv2.LINE_AA)
     return image
 
 
@@ -146,7 +144,7 @@ def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     return _concatenate([side_by_side(row) for row in rows], axis=0)
 
 
-def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
+def write_png(path: FilePath, image: np.ndarray) -> None:
     """Write an image (see `to_uint8`) as PNG; the file is written atomically, missing folders are
     created.
 

@@ -248,9 +248,7 @@ class Drawing:
         sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
         lanes = np.asarray(self.lanes)
         if len(lanes):
-            sums[lanes] = np.stack(
-                [np.asarray(channel_sums) for channel_sums in self._sums(image, channels)], axis=1
-            )
+            sums[lanes] = np.stack(self._sums(image, channels), axis=1)
         return sums.reshape(-1, self.count, channels)
 
     def totals(self, image: Float, channels: int) -> np.ndarray:

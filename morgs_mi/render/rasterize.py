@@ -164,9 +164,15 @@ def rasterize(
     config = RenderConfig() if config is None else config
     is_stack = isinstance(camera, Sequence)
     cameras = tuple(camera) if is_stack else (camera,)
-    options = {"background": background, "features": features, "config": config}
-    options |= {"region": region, "static_splats": static_splats, "depth_limit": depth_limit}
-    options["means2d"] = means2d
+    options = {
+        "background": background,
+        "features": features,
+        "config": config,
+        "region": region,
+        "static_splats": static_splats,
+        "depth_limit": depth_limit,
+        "means2d": means2d,
+    }
     for problem in _problems(gaussians, cameras, channels, detach_weights, options, is_stack):
         raise ValueError(f"rasterize(): {problem}.")
     channels = tuple(dict.fromkeys(channels))

@@ -28,7 +28,7 @@ from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.composite import Columns, composite, cropped
-from morgs_mi.surfaces.surface_view import Crop, SampledPixels, SurfaceView
+from morgs_mi.surfaces.surface_view import Crop, SampledPixels, SurfaceView, ellipsoids_of
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
     """Return the Gaussians of all shapes, padded with zeros to the largest number of SH
     coefficients.
     """
-    parts = [_shape_gaussians(shape, attributes) for shape in _ellipsoids(scene)]
+    parts = [_shape_gaussians(shape, attributes) for shape in ellipsoids_of(scene)]
     K = max(part["sh_coeffs"].shape[1] for part in parts)
     for part in parts:
         N, present, _ = part["sh_coeffs"].shape
@@ -128,13 +128,8 @@ def _scene_problems(
                 "remove it from the scene, or set `surfaces` to an integrator that renders it, "
                 "such as `path`"
             )
-    if not _ellipsoids(scene):
+    if not ellipsoids_of(scene):
         yield "expected a scene with an `ellipsoids` shape, got none; add one"
-
-
-def _ellipsoids(scene: Any) -> list[Any]:
-    """Return the shapes of a scene that are Gaussians."""
-    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
 
 
 def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
@@ -387,7 +382,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def _inputs(self, scene: Any, sensor: Any) -> list[Any]:
         """Return all values that an image depends on, but for the integrator's fixed settings."""
-        parts = (_sensor_of(scene, sensor), *_ellipsoids(scene))
+        parts = (_sensor_of(scene, sensor), *ellipsoids_of(scene))
         tables: list[Any] = [mi.traverse(part) for part in parts]
         values = [value for table in tables for _, value in table]
         return [leaf for value in [*values, self.background] for leaf in _leaves(value)]
@@ -427,9 +422,12 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             columns = self._splats(gaussians, cameras, channels, crop)
         else:
             columns = composite(gaussians, channels, self.background, surfaces, self.config)
-        values = [*columns["color"], *(columns["alpha"] if has_alpha else [])]
-        values += [mi.Float(1)]  # the sample's weight
-        values += [value for name in self.aovs for value in columns[name]]
+        values = [
+            *columns["color"],
+            *(columns["alpha"] if has_alpha else []),
+            mi.Float(1),  # the sample's weight
+            *(value for name in self.aovs for value in columns[name]),
+        ]
 
         film.prepare(self.aov_names())
         block = film.create_block()

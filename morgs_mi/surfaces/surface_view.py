@@ -60,6 +60,11 @@ def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[No
         integrator.splats = None
 
 
+def ellipsoids_of(scene: Any) -> list[Any]:
+    """Return the shapes of a scene that are Gaussians."""
+    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+
+
 def surface_scene(scene: Any) -> Any:
     """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces
     nor an environment.
@@ -133,9 +138,8 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
-    tables = [mi.traverse(shape) for shape in shapes]
-    pairs = zip(shapes, tables, strict=True)
-    attached = [(params, key, params[key]) for shape, params in pairs for key in _attached(shape)]
+    tables = [(shape, mi.traverse(shape)) for shape in shapes]
+    attached = [(params, key, params[key]) for shape, params in tables for key in _attached(shape)]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:
@@ -212,7 +216,7 @@ class SurfaceView:
         scene = surface_scene(whole)
         if scene is None:
             return None
-        gaussians = [shape for shape in whole.shapes() if shape.is_ellipsoids()]
+        gaussians = ellipsoids_of(whole)
         sensor = pixels.sensor()
         rays = rays_for(integrator, splats, config)
         with dr.suspend_grad(), traced(integrator, rays, srgb):
