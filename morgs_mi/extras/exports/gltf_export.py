@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, unit_vectors
 from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.core.files import atomic_path
@@ -156,5 +156,5 @@ def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
     right, _, forward = (side - (side @ up) * up for side in cameras[0].rotation)
     if np.linalg.norm(right) < 0.5:  # the camera is rolled by 90 degrees: its right is nearly up
         right = forward
-    right /= np.linalg.norm(right)
+    right = unit_vectors(right)
     return np.stack([right, up, np.cross(right, up)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -62,7 +61,7 @@ class Import:
                 frames,
                 check_output(out),
                 self.fps,
-                replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options),
+                CodecConfig(keyframe_interval=self.keyframe_interval, **options),
                 self.axes,
                 lambda done, of: report("Importing", done, of),
                 most_invalid=1.0 if self.drop_invalid else 0.0,

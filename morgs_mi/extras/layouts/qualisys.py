@@ -128,8 +128,8 @@ def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
     viewmat = rigid(where, pose_at(R, position))
     lens = opencv_lens(_numbers(where, element, "intrinsic", _DISTORTION))
     with errors_at(where):
-        size = round(right - left + 1), round(bottom - top + 1)
-        return Camera(K, viewmat, *size, serial), lens
+        width = round(right - left + 1)
+        return Camera(K, viewmat, width, round(bottom - top + 1), serial), lens
 
 
 def _numbers(where: str, camera: Element, name: str, keys: Sequence[str]) -> list[float]:

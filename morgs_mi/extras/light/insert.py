@@ -120,7 +120,7 @@ def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
         ValueError: a broken packet, or no frame.
     """
     frame_numbers(stream)
-    _, gaussians = next(iter(play(stream)))
+    _, gaussians = next(play(stream))
     return (
         "color",
         "alpha",
@@ -400,8 +400,7 @@ class _Receivers:
         weights = np.array(dr.detach(gaussians.opacities), np.float64)[near] + 1e-9
         weights /= weights.sum(1, keepdims=True)
         ends = np.arange(0, near.size + 1, near.shape[1])
-        shape = (len(means), len(means))
-        mixture = csr_array((weights.ravel(), near.ravel(), ends), shape=shape)
+        mixture = csr_array((weights.ravel(), near.ravel(), ends), (len(means), len(means)))
         # The covariance of the mixture: the mean of its second moments, minus the second moment of
         # its centre.
         centered = means - means.mean(0)
