@@ -125,7 +125,7 @@ class ProvisionalFrame:
     def __post_init__(self) -> None:
         self.path.unlink(missing_ok=True)
 
-    def show(self, keyframe: Packet, progress: Mapping[str, float | None]) -> None:
+    def show(self, keyframe: Packet, progress: Mapping[str, float | None] | None = None) -> None:
         """Write a keyframe, with the progress of its fit in the header's metadata.
 
         If it cannot be written, e.g. because the disk has room for the result alone, a warning is
@@ -202,6 +202,7 @@ class Recording:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._writer.close()
+        self._files.provisional.unlink(missing_ok=True)
         self._files.settle()
         if kind is None:
             self._check_in_place()

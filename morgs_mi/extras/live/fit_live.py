@@ -280,14 +280,12 @@ def _fit(
     metadata |= about_lenses(prepared.capture)
     files = FitFiles.of(out)
     provisional = ProvisionalFrame(files.provisional, prepared.capture, metadata)
-    # Viewers see no progress of it.
-    show = partial(provisional.show, progress={"seconds": 0.0, "share": 0.0})
     with Recording(files, prepared.capture, metadata) as recording:
         try:
             for frame_set, frame in frames:
                 writing_task = in_background(partial(_record, frames, out, frame_set, frame))
                 packet, report = push_frame(
-                    loop, frame, train, None if rows else on_stage, None, show
+                    loop, frame, train, None if rows else on_stage, None, provisional.show
                 )
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 writing_task.result()
@@ -311,8 +309,6 @@ def _fit(
             if rows:
                 error.add_note(f"{out / 'stream.morgs'} ends with frame {rows[-1].frame}.")
             raise
-        finally:
-            files.provisional.unlink(missing_ok=True)
     return rows
 
 
