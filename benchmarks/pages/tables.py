@@ -19,6 +19,7 @@ from benchmarks.reports import (
 )
 from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import markdown
+from benchmarks.speed import stages
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -180,6 +181,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "parts": parts,
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     "splat_files": splat_files,
+    "stages": lambda: stages.table(committed("stages")["profiles"]),
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),
 }

@@ -144,6 +144,21 @@ class Scene:
         return frames
 
 
+def default_config(size: Size, epochs: int) -> StreamConfig:
+    """Return the default settings for the Gaussians of a size."""
+    density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
+    return StreamConfig(FitConfig(sh_degree=0, epochs=epochs, density=density))
+
+
+def loop_of(scene: Scene, config: StreamConfig, images: list[np.ndarray]) -> StreamLoop:
+    """Return a loop whose next frame is 1, with the images of frame 0 by camera."""
+    cameras = scene.cameras()
+    loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)
+    start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
+    loop.resume(decode(None, keyframe_packet(start, 0, cameras, config.codec)), [images[1:]])
+    return loop
+
+
 def measure(
     scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]], live: bool = True
 ) -> dict[str, Any]:
@@ -152,16 +167,14 @@ def measure(
 
     Unless they arrive `live`, the next frame is observed while one is fitted, in another thread.
     """
-    cameras = scene.cameras()
-    loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)
-    start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
-    loop.resume(decode(None, keyframe_packet(start, 0, cameras, config.codec)), [recorded[0][1:]])
+    camera = scene.cameras()[0]
+    loop = loop_of(scene, config, recorded[0])
     rows = []
     for images, upcoming in pairwise(recorded[1:]):
         dr.sync_thread()
         _, report = loop.push(images[1:], upcoming=None if live else upcoming[1:])
         assert loop.gaussians is not None
-        image = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
+        image = np.asarray(rasterize(loop.gaussians, camera, ("color",)).color)
         scores = {"bytes": report.num_bytes, "psnr": psnr(np.clip(image, 0, 1), images[0] / 255.0)}
         rows.append({"seconds": report.seconds, **report.active, **scores})
     return {name: float(f"{median(row[name] for row in rows[1:]):.4g}") for name in rows[0]}
@@ -175,14 +188,13 @@ def main(options: Options) -> None:
         size = SIZES[name]
         scene = Scene(size, _SEED)
         images = scene.recorded(options.frames + 2, _SEED)
-        density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
-        fit = FitConfig(sh_degree=0, density=density)
         configs: dict[str, StreamConfig] = {}
         for epochs in options.epochs:
-            config = StreamConfig(replace(fit, epochs=epochs))
+            config = default_config(size, epochs)
             configs |= {f"default, {epochs} epochs{live}": config for live in ("", ", live")}
         if name in options.full:
-            everything = StreamConfig(replace(fit, skip_static=False))
+            config = default_config(size, 8)
+            everything = replace(config, fit=replace(config.fit, skip_static=False))
             configs["8 epochs, nothing left out"] = everything
             configs["paper, 8 epochs"] = apply_preset(everything, "paper")
         rows = {}

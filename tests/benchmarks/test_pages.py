@@ -31,9 +31,9 @@ def test_with_tables__leaves_every_page_as_it_is():
     assert sorted(re.findall(r"<!-- table: (\w+) -->", EVERYTHING)) == sorted(TABLES)
 
 
-def test_index__shows_every_plot_and_lists_every_page(tmp_path):
+def test_pages__show_every_plot_and_the_index_lists_them(tmp_path):
     for name, plot in PLOTS.items():
-        assert f"({name}.png)" in TEXTS["index"]
+        assert f"({name}.png)" in EVERYTHING
         plot().savefig(tmp_path / f"{name}.png")
     pages = re.findall(r"\[[^]]+\]\(([\w-]+)\.md\)", TEXTS["index"].partition("## Pages")[2])
     assert sorted(pages) == sorted(TEXTS.keys() - {"index"})
