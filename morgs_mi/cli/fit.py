@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import Positional
 
-from morgs_mi.cli.console import print_next, print_result, print_warning, progress
+from morgs_mi.cli.console import ERR, print_next, print_result, print_warning, progress
 from morgs_mi.cli.settings import (
     Flag,
     GivenReading,
@@ -125,12 +124,12 @@ class Fit:
 
             stream = self.out / STREAM
             begin = time.monotonic()
-            look = shlex.join(["morgs-mi", "view", str(self.out)])
 
             @cache
             def announce() -> None:
-                seconds = time.monotonic() - begin
-                print_warning(f"A first picture is there after {duration(seconds)}: {look}")
+                if ERR.is_terminal:
+                    seconds = duration(time.monotonic() - begin)
+                    print_warning(f"After {seconds} there is a picture: see `morgs-mi view`.")
 
             with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
                 reports = stream_capture(
