@@ -167,20 +167,26 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
             f"`viewmat` [4][4] of at most {LARGEST:g}, got {name!r:.60}, {width}x{height}, "
             f"{rows!s:.200}"
         )
-    background = None
-    text = fields.get("background")
-    if text is not None:
-        with contextlib.suppress(TypeError, ValueError):
-            data = base64.b64decode(text)
-            # Its own size first: a small file can claim any number of pixels.
-            if imagesize.get(io.BytesIO(data)) == (width, height):
-                background = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
-        if background is None:
-            raise ValueError(
-                f"`{where}.background` must be a PNG image of {width}x{height} pixels in base64, "
-                f"got {text!r:.60}"
-            )
+    background = fields.get("background")
+    if background is not None:
+        background = _image_of(background, f"{where}.background", (width, height))
     return Camera(K, viewmat, width, height, name=name, near=near, background=background)
+
+
+def _image_of(text: Any, where: str, size: tuple[int, int]) -> np.ndarray:
+    """Return the image [H, W, 3] of a PNG file in base64; `size` is (W, H)."""
+    image = None
+    with contextlib.suppress(TypeError, ValueError):
+        data = base64.b64decode(text)
+        # Its own size first: a small file can claim any number of pixels.
+        if imagesize.get(io.BytesIO(data)) == size:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise ValueError(
+            f"`{where}` must be a PNG image of {size[0]}x{size[1]} pixels in base64, got "
+            f"{text!r:.60}"
+        )
+    return image
 
 
 def _entries(

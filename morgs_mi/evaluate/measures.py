@@ -83,25 +83,7 @@ class Quality(Measure):
         self._psnr: list[float] = []
 
     def add_view(self, view: ComparedView) -> None:
-        rendered = view.rendered
-        whole = valid_pixels(view.valid, rendered.shape)
-        moving = np.zeros_like(whole) if view.moving is None else whole & view.moving
-        still = np.zeros_like(whole) if view.moving is None else whole & ~moving
-        regions = {"": whole, "_moving": moving, "_still": still}
-        a, b = unit_pair("evaluate_stream", rendered, view.recorded)
-        exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
-        scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), whole))}
-        if view.light is not None:
-            scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
-        errors = _by_region("psnr", np.square(a - b), regions)
-        scores |= {name: psnr_of(error) for name, error in errors.items()}
-        scores |= _by_region("delta_e", delta_e_map(a, b), regions)
-        if min(a.shape[:2]) >= WINDOW:
-            scores |= _by_region("ssim", ssim_map(a, b), regions)
-        if self._lpips is not None:
-            distance = self._lpips.distance_map(rendered, view.recorded)
-            of_image = distance.shape != a.shape[:2]
-            scores |= _by_region("lpips", distance, {"": None} if of_image else regions)
+        scores = _image_scores(view, self._lpips)
         # A keyframe has no motion.
         if view.frame.kind == PacketKind.RESIDUAL and view.truth is not None:
             motion = view.maps["motion"]
@@ -181,6 +163,30 @@ class Motion3D(Measure):
         opacities = np.asarray(last_state.gaussians.opacities)[last_rows]
         points = tracks.points[:, state.frame - 1], tracks.points[:, state.frame], tracks.ids
         return {"motion_3d": evaluate_motion(old, new - old, opacities, points, views)}
+
+
+def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
+    """Return the scores of a rendered image by metric and region."""
+    rendered = view.rendered
+    whole = valid_pixels(view.valid, rendered.shape)
+    moving = np.zeros_like(whole) if view.moving is None else whole & view.moving
+    still = np.zeros_like(whole) if view.moving is None else whole & ~moving
+    regions = {"": whole, "_moving": moving, "_still": still}
+    a, b = unit_pair("evaluate_stream", rendered, view.recorded)
+    exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
+    scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), regions[""]))}
+    if view.light is not None:
+        scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
+    errors = _by_region("psnr", np.square(a - b), regions)
+    scores |= {name: psnr_of(error) for name, error in errors.items()}
+    scores |= _by_region("delta_e", delta_e_map(a, b), regions)
+    if min(a.shape[:2]) >= WINDOW:
+        scores |= _by_region("ssim", ssim_map(a, b), regions)
+    if lpips is not None:
+        distance = lpips.distance_map(rendered, view.recorded)
+        of_image = distance.shape != a.shape[:2]
+        scores |= _by_region("lpips", distance, {"": None} if of_image else regions)
+    return scores
 
 
 def _by_region(

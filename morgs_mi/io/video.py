@@ -387,30 +387,11 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
 
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
-        ValueError: as `VideoReader.open` and `FolderReader.open`, or there are far more timestamps
-            than images.
+        ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
-    folders = [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
-    files_by_number = {folder: _images(folder) for folder in folders}
-    readers: dict[Clip, FrameReader] = {}
-    for group in counting_together({f: sorted(files) for f, files in files_by_number.items()}):
-        images_of_group = [files_by_number[folder] for folder in group]
-        numbers = sorted(set().union(*images_of_group))
-        steps = np.diff(numbers)
-        step = math.gcd(*steps.tolist()) or 1
-        if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-            gap = int(np.argmax(steps))
-            last = numbers[gap + 1]
-            file = next(files[last] for files in images_of_group if last in files)
-            raise ValueError(
-                f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
-                "remove or renumber it."
-            )
-        timestamps = range(numbers[0], numbers[-1] + 1, step)
-        for folder, files in zip(group, images_of_group, strict=True):
-            suffix = next(iter(files.values())).suffix
-            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
-            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
+    readers = _aligned_folders(
+        [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
+    )
     return _with_white(
         [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
     )
@@ -445,6 +426,34 @@ def _with_white(readers: list[FrameReader]) -> list[FrameReader]:
         _WHITE,
     )
     return [replace(r, white=white) if isinstance(r, FolderReader) else r for r in readers]
+
+
+def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
+    """Return the readers of folders of images, aligned by the numbers of their images.
+
+    Raises:
+        ValueError: there are far more timestamps than images.
+    """
+    files_by_number = {folder: _images(folder) for folder in folders}
+    readers: dict[Clip, FrameReader] = {}
+    for group in counting_together({f: sorted(files) for f, files in files_by_number.items()}):
+        clips = [files_by_number[folder] for folder in group]
+        numbers = sorted(set().union(*clips))
+        steps = np.diff(numbers)
+        step = math.gcd(*steps.tolist()) or 1
+        if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
+            gap = int(np.argmax(steps))
+            file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
+            raise ValueError(
+                f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
+                "remove or renumber it."
+            )
+        timestamps = range(numbers[0], numbers[-1] + 1, step)
+        for folder, files in zip(group, clips, strict=True):
+            suffix = next(iter(files.values())).suffix
+            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
+            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
+    return readers
 
 
 def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:

@@ -134,19 +134,7 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     # rounding errors.
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
     half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * float(np.exp(np.median(sizes))), least)
-    center = (low + high) / 2
-    up, forward = _DIRECTIONS[axes]
-    # The first camera sees the box; the others keep its distance from the middle.
-    tall = np.abs(up) @ half
-    wide = np.abs(np.cross(forward, up)) @ half
-    deep = np.abs(forward) @ half
-    distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / np.tan(np.deg2rad(_FOV_X / 2))
-    angles = np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)
-    arms = Rotation.from_rotvec(angles[:, None] * up).apply(-forward)
-    ring = tuple(
-        Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name)
-        for name, arm in zip(_NAMES, arms, strict=True)
-    )
+    ring = _ring((low + high) / 2, half, axes)
     some = thinned(next(filter(len, frames)))
     details = []  # mean differences between neighbouring pixels
     for camera in ring:
@@ -155,6 +143,22 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
         details.append(sum(np.abs(np.diff(image, axis=axis)).mean() for axis in (0, 1)))
     best = int(np.argmax(details))
     return ring[best:] + ring[:best]
+
+
+def _ring(center: np.ndarray, half: np.ndarray, axes: Axes) -> tuple[Camera, ...]:
+    """Return the cameras around a box with half the sides `half` [3], the front one first."""
+    up, forward = _DIRECTIONS[axes]
+    # The first camera sees the box; the others keep its distance from the middle.
+    tall = np.abs(up) @ half
+    wide = np.abs(np.cross(forward, up)) @ half
+    deep = np.abs(forward) @ half
+    distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / np.tan(np.deg2rad(_FOV_X / 2))
+    angles = np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)
+    arms = Rotation.from_rotvec(angles[:, None] * up).apply(-forward)
+    return tuple(
+        Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name)
+        for name, arm in zip(_NAMES, arms, strict=True)
+    )
 
 
 def thinned(gaussians: Gaussians) -> Gaussians:

@@ -309,19 +309,7 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
     """
     coverage = dr.zeros(mi.Float, crop[2] * crop[3])
     depth = dr.full(mi.Float, dr.inf, crop[2] * crop[3])
-    box = scene.bbox()
-    if not box.valid():  # no surface
-        return coverage, depth
-    # The part of the crop that the corners of the box may reach.
-    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
-    pixels, depths = camera.project(np.array(list(product(*ends.T))))
-    low = np.zeros(2)
-    high = np.array(crop[2:])
-    if (depths >= camera.near).all():
-        ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
-        low, high = np.clip(ends - crop[:2], 0, high)
-    first = low.astype(int).tolist()
-    across, down = (high - low).astype(int).tolist()
+    first, (across, down) = _rectangle(scene.bbox(), camera, crop)
     if not across * down:
         return coverage, depth
     lane: UInt32 = dr.arange(mi.UInt32, across * down)
@@ -347,6 +335,22 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
     )
     dr.eval(coverage, depth)
     return coverage, depth
+
+
+def _rectangle(box: Any, camera: Camera, crop: Crop) -> tuple[list[int], list[int]]:
+    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from
+    there, (x, y).
+    """
+    if not box.valid():  # no surface
+        return [0, 0], [0, 0]
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    pixels, depths = camera.project(np.array(list(product(*ends.T))))
+    low = np.zeros(2)
+    high = np.array(crop[2:])
+    if (depths >= camera.near).all():
+        ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
+        low, high = np.clip(ends - crop[:2], 0, high)
+    return low.astype(int).tolist(), (high - low).astype(int).tolist()
 
 
 def _environment(scene: Any, sensor: Any) -> Any:

@@ -206,23 +206,10 @@ def refine_cameras(
     calibrated = scores[0] if has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
     changes = estimates[best]
-    shifts = []
-    for camera, change in zip(problem.cameras, changes, strict=True):
-        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * camera.size
-        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
-    vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
-    sizes = [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
-    refinement = Refinement(is_better, calibrated, scores[best], tracks, *sizes)
-    if not is_better:
-        return capture, refinement
-    cameras = list(capture.cameras)
-    distortions = np.zeros((len(cameras), 2))
-    for v, change in zip(problem.indices, changes, strict=True):
-        cameras[v] = changed_camera(cameras[v], change)
-        distortions[v] = change[9:]
-    rig = capture.with_cameras(cameras, distortions.tolist())
-    points = _moved(capture.points, problem.cameras, changes)
-    return replace(rig, points=points), refinement
+    refinement = Refinement(
+        is_better, calibrated, scores[best], tracks, *_sizes(problem.cameras, changes)
+    )
+    return problem.changed_capture(changes) if is_better else capture, refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,6 +283,16 @@ class _Problem:
             views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
             scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
         return scores
+
+    def changed_capture(self, changes: np.ndarray) -> Capture:
+        """Return the capture with changed cameras and moved points."""
+        cameras = list(self.capture.cameras)
+        distortions = np.zeros((len(cameras), 2))
+        for v, change in zip(self.indices, changes, strict=True):
+            cameras[v] = changed_camera(cameras[v], change)
+            distortions[v] = change[9:]
+        rig = self.capture.with_cameras(cameras, distortions.tolist())
+        return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
         """Return the problem of a short fit with changed cameras."""
@@ -387,6 +384,18 @@ def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
             mask = valid
         changed_views.append(View(camera, image, mask))
     return changed_views
+
+
+def _sizes(cameras: Sequence[Camera], changes: np.ndarray) -> list[float]:
+    """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by
+    the lens.
+    """
+    shifts = []
+    for camera, change in zip(cameras, changes, strict=True):
+        corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * camera.size
+        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
+    vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
+    return [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:

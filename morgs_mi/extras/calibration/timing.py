@@ -224,35 +224,10 @@ class _Clips:
         """Return the sum of the equations of all timestamps, with images interpolated by offsets
         [V] of at most `largest` and blurred.
         """
-        divisor = 2 if blur else 1
-        fit = FitConfig(
-            sh_degree=0,
-            num_gaussians=GAUSSIANS // divisor,
-            first_frame_steps=STEPS // divisor,
-            dropout=0.0,
-            density=DensityConfig(rounds=0),
-        )
-        train = np.isin(np.arange(len(self.cameras)), self.train)
         parts = []
         last = self.num_frames - 2 - largest
         for timestamp in np.linspace(largest, last, _TIMESTAMPS).round().astype(int):
-            times = timestamp - offsets
-            images = self.at(times)
-            next_images = self.at(times + 1)
-            views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
-            rng = rng_of(0, Stream.TIMING)
-            points = (self.capture.points, self.capture.point_colors)
-            problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
-            gaussians = fit_first_frame(problem, fit, rng).gaussians
-            pairs = {
-                v: FramePair(next_images[v], images[v], valid=self.masks[v]) for v in self.train
-            }
-            active_views = [ActiveView(camera) for camera in self.cameras]
-            train_views = {v: active_views[v] for v in self.train}
-            flow = lift_flow(gaussians, train_views, observe_key_views(pairs))
-            gaussians = replace(gaussians, motion=flow.displacement)
-            targets = list(map(Target, images, self.masks))
-            parts.append(offset_equations(gaussians, active_views, targets, train, blur))
+            parts.append(self._equations_at(timestamp - offsets, blur))
             self.done += 1
             if self.progress is not None:
                 # There are fewer fits if a round is left out.
@@ -266,3 +241,28 @@ class _Clips:
             "record something that moves",
         )
         return equations
+
+    def _equations_at(self, times: np.ndarray, blur: float) -> OffsetEquations:
+        """Return the equations of a timestamp, which each view shows at its own time [V]."""
+        images = self.at(times)
+        next_images = self.at(times + 1)
+        pairs = {v: FramePair(next_images[v], images[v], valid=self.masks[v]) for v in self.train}
+        divisor = 2 if blur else 1
+        fit = FitConfig(
+            sh_degree=0,
+            num_gaussians=GAUSSIANS // divisor,
+            first_frame_steps=STEPS // divisor,
+            dropout=0.0,
+            density=DensityConfig(rounds=0),
+        )
+        fit_views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
+        rng = rng_of(0, Stream.TIMING)
+        points = (self.capture.points, self.capture.point_colors)
+        problem = FirstFrameProblem.of(fit_views, points, fit, RenderConfig(), rng)
+        gaussians = fit_first_frame(problem, fit, rng).gaussians
+        views = [ActiveView(camera) for camera in self.cameras]
+        flow = lift_flow(gaussians, {v: views[v] for v in self.train}, observe_key_views(pairs))
+        gaussians = replace(gaussians, motion=flow.displacement)
+        targets = list(map(Target, images, self.masks))
+        train = np.isin(np.arange(len(views)), self.train)
+        return offset_equations(gaussians, views, targets, train, blur)

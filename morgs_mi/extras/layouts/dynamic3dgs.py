@@ -77,6 +77,23 @@ def read_meta(path: Path) -> dict[str, tuple[Camera, tuple[Path, ...]]]:
     return cameras
 
 
+def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions [P, 3] and colours [P, 3] in [0, 1] in `init_pt_cld.npz`.
+
+    Raises:
+        ValueError: it is not a NumPy archive with an array `data` [P, 6 or more] of finite numbers.
+    """
+    rows = numbers(path, "data", read_array(path, "data"))
+    require(
+        rows.ndim == 2 and rows.shape[1] >= 6 and bounded(rows),
+        path,
+        "`data` must be [P, 7], finite",
+        f"{rows.dtype} {rows.shape}",
+        "export it again",
+    )
+    return rows[:, :3], rows[:, 3:6].astype(np.float32)
+
+
 def _read_calibration(path: Path) -> Calibration:
     """Return the training cameras and the test cameras, which are held out; cameras without images
     are left out.
@@ -89,18 +106,7 @@ def _read_calibration(path: Path) -> Calibration:
         _LOG.warning("%s: no image of %s was found: left out.", path / "ims", ", ".join(empty))
         names = [name for name in names if name not in empty]
     cloud = path / "init_pt_cld.npz"
-    points = colors = NO_POINTS
-    if cloud.is_file():
-        table = numbers(cloud, "data", read_array(cloud, "data"))
-        require(
-            table.ndim == 2 and table.shape[1] >= 6 and bounded(table),
-            cloud,
-            "`data` must be [P, 7], finite",
-            f"{table.dtype} {table.shape}",
-            "export it again",
-        )
-        points = table[:, :3]
-        colors = table[:, 3:6].astype(np.float32)
+    points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
     cameras, clips = zip(*(rig[name] for name in names), strict=True)
     test_views = tuple(index for index, name in enumerate(names) if name in test)
     return Calibration(cameras, (Lens(),) * len(names), clips, points, colors, test_views or None)

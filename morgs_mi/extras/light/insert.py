@@ -120,7 +120,7 @@ def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
         ValueError: a broken packet, or no frame.
     """
     frame_numbers(stream)
-    _, gaussians = next(play(stream))
+    _, gaussians = next(iter(play(stream)))
     return (
         "color",
         "alpha",
@@ -393,14 +393,7 @@ class _Receivers:
 
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
         means = np.array(dr.detach(gaussians.means), np.float64)
-        # The weights [N, N] of the Gaussians around each one, by their opacities.
-        _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
-        near = near.reshape(len(means), -1)
-        # An opacity may be 0 in float32.
-        weights = np.array(dr.detach(gaussians.opacities), np.float64)[near] + 1e-9
-        weights /= weights.sum(1, keepdims=True)
-        ends = np.arange(0, near.size + 1, near.shape[1])
-        mixture = csr_array((weights.ravel(), near.ravel(), ends), (len(means), len(means)))
+        mixture = _mixture(means, np.array(dr.detach(gaussians.opacities), np.float64))
         # The covariance of the mixture: the mean of its second moments, minus the second moment of
         # its centre.
         centered = means - means.mean(0)
@@ -420,6 +413,17 @@ class _Receivers:
     def response(self, direction: Any) -> Float:
         """Return the received fraction of light from a direction."""
         return dr.lerp(0.5, dr.maximum(dr.dot(self.normals, direction), 0), self.flat)
+
+
+def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:
+    """Return the weights [N, N] of the Gaussians around each one, by their opacities [N]."""
+    _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
+    near = near.reshape(len(means), -1)
+    # An opacity may be 0 in float32.
+    weights = opacities[near] + 1e-9
+    weights /= weights.sum(1, keepdims=True)
+    ends = np.arange(0, near.size + 1, near.shape[1])
+    return csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
 
 
 def _irradiance(

@@ -73,17 +73,11 @@ def light_probe(
     check_number(place, "height", height, "[4, 8192]")
     check_number(place, "clipped", clipped, "[1, inf)")
     center = check_point(place, "position", position)
-    # The directions [H, 2 H, 3] of the map's texels; its first and last rows are the poles.
-    rows = int(height)
-    theta = np.pi * np.arange(rows)[:, None] / (rows - 1)
-    phi = 2 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
-    horizontal = np.sin(theta) * np.sin(phi)
-    vertical = np.broadcast_to(np.cos(theta), horizontal.shape)
-    directions = np.stack([horizontal, vertical, -np.sin(theta) * np.cos(phi)], axis=-1)
+    directions = _directions(int(height))
     axis = np.abs(directions).argmax(-1)
     largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
     # A face has as many pixels per degree as the map.
-    size = max(rows // 2, 4)
+    size = max(int(height) // 2, 4)
     width = size + 2 * _MARGIN
     fov = np.rad2deg(2 * np.arctan(width / size))
     color = np.zeros((*directions.shape[:2], 3), np.float32)
@@ -108,6 +102,17 @@ def check_point(place: str, name: str, point: ArrayLike) -> np.ndarray:
     is_point = point.shape == (3,) and np.isfinite(point).all()
     require(is_point, place, f"`{name}` must be [3] and finite", point.tolist(), "pass x, y and z")
     return point
+
+
+def _directions(height: int) -> np.ndarray:
+    """Return the directions [H, 2 H, 3] of the texels of an `envmap`; its first and last rows are
+    the poles.
+    """
+    theta = np.pi * np.arange(height)[:, None] / (height - 1)
+    phi = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
+    x = np.sin(theta) * np.sin(phi)
+    z = -np.sin(theta) * np.cos(phi)
+    return np.stack([x, np.broadcast_to(np.cos(theta), x.shape), z], axis=-1)
 
 
 def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:

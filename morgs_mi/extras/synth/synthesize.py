@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -183,14 +183,43 @@ def _mixed_seed(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
+def _record_light(
+    tracer: PathTracer,
+    camera: Camera,
+    disturbance: CameraDisturbance,
+    frame: int,
+    config: SynthConfig,
+) -> np.ndarray:
+    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear
+    [H, W, 3].
+
+    Args:
+        tracer: the scene; its time is changed.
+        camera: the view without distortion.
+        disturbance: of the camera.
+        frame: index of the frame.
+        config: samples per pixel, their seed and the frame rate.
+    """
+    assert config.spp is not None
+    if not disturbance.rolling_shutter and not disturbance.distortion:
+        tracer.set_time((frame + disturbance.time_offset) / config.fps)
+        return tracer.light(camera, config.spp, config.seed)
+    row_times = disturbance.row_times(frame, camera.height)
+    count = -(-camera.height // _BAND) if disturbance.rolling_shutter else 1
+    bands = []
+    for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
+        tracer.set_time(row_times[rows].mean() / config.fps)
+        seed = _mixed_seed(config.seed, band)
+        bands.append(tracer.light_of_rows(camera, rows, config.spp, seed, disturbance.lens))
+    return np.concatenate(bands)
+
+
 def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | None) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
     config = rig.config
     noise = config.noise
-    spp = config.spp
     assert noise is not None
-    assert spp is not None
-    image_count = itertools.count(1)
+    count = itertools.count(1)
 
     def images(index: int, camera: Camera) -> Iterator[np.ndarray]:
         for frame in range(config.frames):
@@ -198,23 +227,10 @@ def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | 
             # texture.
             seed = _mixed_seed(config.seed, index, frame)
             disturbance = rig.disturbed[index]
-            if not disturbance.rolling_shutter and not disturbance.distortion:
-                tracer.set_time((frame + disturbance.time_offset) / config.fps)
-                light = tracer.light(camera, spp, seed)
-            else:
-                row_times = disturbance.row_times(frame, camera.height)
-                count = -(-camera.height // _BAND) if disturbance.rolling_shutter else 1
-                bands = []
-                for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
-                    tracer.set_time(row_times[rows].mean() / config.fps)
-                    band_seed = _mixed_seed(seed, band)
-                    bands.append(
-                        tracer.light_of_rows(camera, rows, spp, band_seed, disturbance.lens)
-                    )
-                light = np.concatenate(bands)
+            light = _record_light(tracer, camera, disturbance, frame, replace(config, seed=seed))
             yield developed(light, noise, seed)
             if progress is not None:
-                progress(next(image_count), len(rig.cameras) * config.frames)
+                progress(next(count), len(rig.cameras) * config.frames)
 
     clips = []
     for index, camera in enumerate(rig.cameras):
@@ -274,18 +290,18 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
             truth = compute_ground_truth(camera, surface, poses, old_poses, next_poses)
             save_truth(folder, camera.name, frame, truth)
             old_poses = poses
-    save_tracks(folder, _sample_tracks(tracer, rig))
+    rng = np.random.default_rng([rig.config.seed, 1])
+    save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
     save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
 
 
-def _sample_tracks(tracer: PathTracer, rig: _Rig) -> Tracks:
+def _sample_tracks(
+    tracer: PathTracer, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator
+) -> Tracks:
     """Return the tracks of surface points that are visible in the first, middle or last frame.
 
     Half of the points lie on moving objects.
     """
-    cameras = rig.cameras
-    times = np.arange(rig.config.frames) / rig.config.fps
-    rng = np.random.default_rng([rig.config.seed, 1])
     starts = sorted({0, len(times) // 2, len(times) - 1})
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points = []

@@ -153,42 +153,7 @@ class Viewer:
         return HTMLResponse(served_page(stream_name(self._stream), server))
 
     def _send_stream(self, request: Request) -> Response:
-        """Return the answer to a request of the stream, or of a range of its bytes.
-
-        Bytes that are written meanwhile are left out. The entity tag stays the same while the
-        stream grows.
-
-        Raises:
-            OSError: the file cannot be read.
-            ValueError: it is no stream, or no regular file.
-        """
-        path = self._newest()
-        file = open_regular(path, follow=False)  # `_parts` closes it
-        size = os.fstat(file.fileno()).st_size
-        start = file.read(PREAMBLE.size + PAYLOAD)
-        if not MAGIC.startswith(start[: len(MAGIC)]):
-            file.close()
-            raise ValueError(f"{path}: expected a stream, got another file; fit the capture again.")
-        # The tag has the inode and the checksums of the header and of the first frame.
-        length = 0
-        if len(start) == PREAMBLE.size + PAYLOAD:
-            length = HEAD.unpack_from(start, PREAMBLE.size)[2]
-        file.seek(min(len(start) + length, size))
-        etag = f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
-        location = quote(os.fsencode(path.name))
-        headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": location}
-        part = range(size)
-        status = 200
-        match = _RANGE.fullmatch(request.headers.get("range", ""))
-        if match is not None and request.headers.get("if-range", etag) == etag:
-            part = part[int(match[1]) : int(match[2]) + 1 if match[2] else None]
-            status = 206
-            headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
-        if status == 206 and not part:
-            file.close()
-            return PlainTextResponse("", 416, {"Content-Range": f"bytes */{size}"})
-        # Without the number of bytes: a fit may truncate the file meanwhile, to go on from there.
-        return StreamingResponse(_parts(file, part), status, headers, "application/octet-stream")
+        return _stream_response(self._newest(), request)
 
     def _send_recorded(self, request: Request) -> Response:
         image = self._recorded.at(StreamReader(self._newest(), follow=False), **request.path_params)
@@ -208,6 +173,44 @@ class Viewer:
 async def _failed(_: Request, error: Exception) -> Response:
     text = str(error).encode(errors="replace")  # a name may have bytes that are not UTF-8
     return PlainTextResponse(text, 404 if isinstance(error, FileNotFoundError) else 400)
+
+
+def _stream_response(path: Path, request: Request) -> Response:
+    """Return the answer to a request of a file, or of a range of its bytes.
+
+    Bytes that are written meanwhile are left out. The entity tag stays the same while the stream
+    grows.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no stream, or no regular file.
+    """
+    file = open_regular(path, follow=False)  # `_parts` closes it
+    size = os.fstat(file.fileno()).st_size
+    start = file.read(PREAMBLE.size + PAYLOAD)
+    if not MAGIC.startswith(start[: len(MAGIC)]):
+        file.close()
+        raise ValueError(f"{path}: expected a stream, got another file; fit the capture again.")
+    # The tag has the inode and the checksums of the header and of the first frame.
+    length = 0
+    if len(start) == PREAMBLE.size + PAYLOAD:
+        length = HEAD.unpack_from(start, PREAMBLE.size)[2]
+    file.seek(min(len(start) + length, size))
+    etag = f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
+    location = quote(os.fsencode(path.name))
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": location}
+    part = range(size)
+    status = 200
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if match is not None and request.headers.get("if-range", etag) == etag:
+        part = part[int(match[1]) : int(match[2]) + 1 if match[2] else None]
+        status = 206
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+    if status == 206 and not part:
+        file.close()
+        return PlainTextResponse("", 416, {"Content-Range": f"bytes */{size}"})
+    # Without the number of bytes: a fit may truncate the file meanwhile, to go on from there.
+    return StreamingResponse(_parts(file, part), status, headers, "application/octet-stream")
 
 
 def _parts(file: BinaryIO, part: range) -> Iterator[bytes]:
