@@ -44,12 +44,12 @@ _FEW_POINTS = 100
 
 
 @dataclass
-class _FirstFrameProgress:
+class FirstFrameProgress:
     """Report that also notes the progress of the first frame, which viewers show."""
 
-    report: Report | None
-    begin: float = field(default_factory=time.perf_counter)
-    first_step: float | None = None
+    report: Report | None  #: Called likewise.
+    begin: float = field(default_factory=time.perf_counter)  #: Of the fit, s.
+    first_step: float | None = None  #: Begin of the first frame's first step, s.
     left: float | None = None  #: Seconds of the steps that are left; None before the first one.
 
     def __call__(self, stage: str, done: float, total: float) -> None:
@@ -105,7 +105,7 @@ def stream_capture(
     check_capacity(
         "stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit
     )
-    watched = _FirstFrameProgress(progress)
+    watched = FirstFrameProgress(progress)
     stages = Progress(watched)
     with locked_folder(out, "stream_capture()"), ExitStack() as at_end:
         files = FitFiles.of(out)

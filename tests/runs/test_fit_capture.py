@@ -22,13 +22,11 @@ from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.files import PROVISIONAL
-from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
+from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
-from morgs_mi.runs import fit_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next
-from morgs_mi.runs.fit_files import ProvisionalFrame, stream_metadata
 from morgs_mi.runs.fit_files import Recording as Files
+from morgs_mi.runs.fit_files import stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
@@ -106,84 +104,6 @@ def kill_and_resume(whole, folder, kills):
             killed += status == -9
         stream_capture(recording(), out, CONFIG, resume=True)
         assert_same(out, whole)
-
-
-@pytest.mark.slow
-def test_stream_capture__shows_a_provisional_first_frame(tmp_path, monkeypatch):
-    """A stream beside the one that is written has a frame for each round of density control, with
-    the time that is left, and is removed before the result is written.
-    """
-    shown = []
-    times = []
-    show = ProvisionalFrame.show
-    write = StreamWriter.write
-
-    def written(writer, packet):
-        assert "provisional" in writer.path.name or not (tmp_path / PROVISIONAL).exists()
-        return write(writer, packet)
-
-    def spy(files, keyframe, progress):
-        show(files, keyframe, progress)
-        provisional = StreamReader(tmp_path / PROVISIONAL)
-        shown.append([packet.encoded for packet in provisional])
-        metadata = provisional.metadata
-        times.append(metadata.pop("provisional")["left"])
-        assert metadata == StreamReader(tmp_path / "stream.morgs").metadata
-        assert not StreamReader(tmp_path / "stream.morgs").index()
-
-    monkeypatch.setattr(ProvisionalFrame, "show", spy)
-    monkeypatch.setattr(StreamWriter, "write", written)
-    density = DensityConfig(rounds=3)
-    fit = replace(
-        CONFIG.fit, num_gaussians=80, first_frame_steps=20, density=density, exposure="off"
-    )
-    stream_capture(recording(num_frames=2), tmp_path, replace(CONFIG, fit=fit))
-    first = next(iter(StreamReader(tmp_path / "stream.morgs")))
-    assert len(shown) == 3
-    assert min(times) >= 0
-    assert [first.encoded] not in shown
-    assert not (tmp_path / PROVISIONAL).exists()
-
-
-def test_stream_capture__shows_pictures_before_it_searches_stereo_points(tmp_path, monkeypatch):
-    """Short fits to triangulated points, with which the result has the same bytes as without."""
-    complete = recording(num_frames=1)
-    points = {"points": np.zeros((0, 3)), "point_colors": np.zeros((0, 3))}
-    bare = replace(complete, **points)
-    shown = []
-    counts = []
-    monkeypatch.setattr(fit_capture, "match_capture", lambda *_: None)
-    monkeypatch.setattr(fit_capture, "triangulate_points", lambda *_: complete)
-    monkeypatch.setattr(
-        fit_capture, "dense_points", lambda *_: counts.append(len(shown)) or complete
-    )
-    stream_capture(bare, tmp_path / "shown", CONFIG, on_provisional=shown.append)
-    assert counts[0] >= 2
-    assert not (tmp_path / "shown" / PROVISIONAL).exists()
-    monkeypatch.setattr(fit_capture, "preview", lambda *_: None)
-    stream_capture(bare, tmp_path / "without", CONFIG)
-    assert stream_of(tmp_path / "shown") == stream_of(tmp_path / "without")
-
-
-@pytest.mark.slow
-def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_room(
-    whole, tmp_path, monkeypatch, caplog
-):
-    write = StreamWriter.write
-
-    def full(writer, packet):
-        if "provisional" in writer.path.name:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        assert not (tmp_path / PROVISIONAL).exists(), "it would take the room of the result"
-        return write(writer, packet)
-
-    monkeypatch.setattr(StreamWriter, "write", full)
-    stream_capture(recording(), tmp_path, CONFIG)
-    assert_same(tmp_path, whole)
-    (message,) = caplog.messages
-    assert message.startswith(
-        f"{tmp_path / PROVISIONAL}: a provisional first frame cannot be written"
-    )
 
 
 def other_fit(out, push=None):
