@@ -292,19 +292,22 @@ def play(
     begin = 0.0
     try:
         while True:
-            end = 0.0
-            for image, at, interval in timed_images(path):
+            images = timed_images(path)
+            following = next(images, None)
+            while following is not None:
+                image, at, interval = following
+                following = next(images, None)
+                if loop and following is None:
+                    # Known before the last image is shown, so that longer clips do not go on.
+                    clock.length = min(clock.length, at + interval)
                 clock.wait(clip, begin + at, interval, closed)
                 if closed.is_set():
                     return
                 if at > clock.length - interval / 2:
                     break
                 yield image
-                end = at + interval
-            else:  # it has ended, before the others
-                if not loop:
-                    return
-                clock.length = min(clock.length, end)
+            if not loop:
+                return
             begin += clock.length
     finally:
         clock.leave(clip)

@@ -48,7 +48,7 @@ def test_play__plays_a_clip_once_at_its_own_speed(tmp_path):
 
 
 def test_play__repeats_clips_together_after_the_shortest(tmp_path):
-    lengths = ((6, 50), (9, 50), (5, 25))
+    lengths = ((6, 20), (9, 20), (5, 10))
     paths = [clip(tmp_path / f"{count}.mkv", count, fps) for count, fps in lengths]
     times, numbers = np.moveaxis(played(paths, 20, loop=True), 2, 0)
     assert numbers[0].tolist() == [*range(6)] * 3 + [0, 1]
@@ -57,7 +57,7 @@ def test_play__repeats_clips_together_after_the_shortest(tmp_path):
     assert numbers[2].tolist() == slow, "at half the rate, without its last two"
     starts = np.stack([time[number == 0][:4] for time, number in zip(times, numbers, strict=True)])
     # The median, because a busy machine may show one image late.
-    assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.019, "within an interval"
+    assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.049, "within an interval"
 
 
 def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch):
