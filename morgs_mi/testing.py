@@ -53,18 +53,6 @@ def mitsuba_variant() -> Iterator[str]:
     mi.set_variant(name)
 
 
-def image_tolerance(num_gaussians: int) -> float:
-    """Return the absolute tolerance of an image of N Gaussians."""
-    return IMAGE_ABS if num_gaussians <= 1000 else STOPPED_IMAGE_ABS
-
-
-def gradient_tolerance(num_gaussians: int) -> float:
-    """Return the tolerance of the gradients of N Gaussians, relative to an attribute's largest
-    entry.
-    """
-    return GRADIENT_REL if num_gaussians <= 1000 else STOPPED_GRADIENT_REL
-
-
 def assert_close(
     actual: Any,
     expected: Any,

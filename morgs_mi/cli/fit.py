@@ -66,8 +66,6 @@ class Fit:
     begins with a keyframe."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/cluster.md)."""
-    reproducible: Flag = False
-    """Sum in a fixed order: on a CPU every fit does; a GPU cannot."""
 
     groups: ClassVar[Mapping[str, Sequence[str]]] = {
         "input": ("frames", "downscale", "trim", "offset", "gaps", "exclude", "near"),

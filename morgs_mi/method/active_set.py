@@ -100,12 +100,12 @@ def responsibility(
         view = changed_view.view
         factor = max(view.camera.width // width, 1)
         h, w = (max(size // factor, 1) for size in changed_view.change.shape)
-        change = changed_view.change.astype(np.float32)
+        change = 255 * changed_view.change.astype(np.uint8)
         share = cv2.resize(change, (w, h), interpolation=cv2.INTER_AREA)
         region = Region.of(share > 0, view.config)
         near += boxes.within(region.block_table, region.grid, factor)
         views_with_changes.append(ActiveView(view.camera.resized(w, h), view.config, region))
-        shares.append(share)
+        shares.append(share / np.float32(255))
         factors.append(factor)
     if not factors:
         return np.zeros(len(gaussians), np.float32)
@@ -120,7 +120,7 @@ def responsibility(
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
     # view.
     area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
-    return np.where(visible, change_weight / np.where(visible, weight * area_ratio, 1), 0)
+    return visible * change_weight / np.maximum(weight * area_ratio, 1e-30)
 
 
 def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
@@ -298,8 +298,6 @@ def _inside_unexplained(changed_view: ChangedView, active: np.ndarray) -> np.nda
     counts = changed_view.counts
     changes = counts > _CHANGED * grid.block[0] * grid.block[1]
     covered = changes & boxes.union(active, grid)
-    if not (changes & ~covered).any():
-        return np.zeros_like(active)
     count, labels = cv2.connectedComponents(changes.astype(np.uint8))
     area, covered_area = (
         np.bincount(labels[blocks], counts[blocks], count) for blocks in (changes, covered)

@@ -37,8 +37,8 @@ _CLOSING = 5
 # Least margin of the box around a change, in px: flow needs something to match.
 _MARGIN = 24
 _SUM = np.ones((1, 3), np.float32)
-# Red minus green, and yellow minus blue; the absolute weights of each sum to 1.
-_COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
+# Red minus green, and yellow minus blue; the absolute weights of each sum to 1 grey level.
+_COLORS = _GREY_LEVEL * np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 
 
 @config_class
@@ -63,22 +63,18 @@ def change_mask(
     """Return the mask of changed pixels [H, W], bool.
 
     Args:
-        reference: an earlier image of the same camera [H, W, 3], uint8 or float in [0, 1].
+        reference: an earlier image of the same camera, uint8 [H, W, 3].
         image: a later one, likewise.
         valid: [H, W] bool, pixels that count; None: all.
         config: settings.
     """
     H, W = reference.shape[:2]
-    if reference.dtype == np.uint8 and image.dtype == np.uint8:  # large images: in integers
-        difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)
-        unit = _GREY_LEVEL
-    else:
-        difference = np.subtract(image, reference, dtype=np.float32)
-        unit = 1.0
-    levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
+    difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)
+    brightness = cv2.transform(difference, _SUM) * np.float32(_GREY_LEVEL / 3)
+    levels = _levels(brightness, 1, config)
     half_size = (max(W // 2, 1), max(H // 2, 1))
     half = cv2.resize(difference, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
+    for channel in cv2.split(cv2.transform(half, _COLORS)):
         color_levels = _levels(channel, 2, config)
         pixel_levels = cv2.resize(color_levels, (W, H), interpolation=cv2.INTER_NEAREST)
         levels = np.maximum(levels, pixel_levels)
@@ -100,7 +96,7 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
         scale: of the resolution.
         config: settings.
     """
-    window = max(_WINDOW // scale, 1) | 1
+    window = _WINDOW // scale | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
     sample = average.ravel()[:: max(1, average.size // 20_000)]
