@@ -165,6 +165,25 @@ def steps() -> str:
     return markdown(("", "step", "ratio to tuned C++", "`volprim_rf_basic`"), rows)
 
 
+def step_parts() -> str:
+    """Return the share of a step that each of its parts takes."""
+    rows: dict[str, list[str]] = {}
+    for name in ("W1", "W2b"):
+        without = committed("step_parts")[name]["shares"]
+        shares = {
+            "projection and lists": 1 - without["blending"],
+            "blending": without["blending"] - without["adjoint"],
+            "adjoint of both": without["adjoint"],
+            "exponentials, in both loops": without["exponentials"],
+            "sums over pixels, in the adjoint": without["sums"],
+            "loads of Gaussians, in both loops": without["loads"],
+            "outside of the blocks: launches, work per Gaussian": 1 - without["all blocks"],
+        }
+        for part, share in shares.items():
+            rows.setdefault(part, [part]).append(f"{100 * share:.0f} %")
+    return markdown(("", "20k Gaussians, 512x384", "100k Gaussians, 1352x1014"), rows.values())
+
+
 TABLES: Mapping[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "cameras": partial(study_table, cameras, "cameras"),
@@ -182,6 +201,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     "splat_files": splat_files,
     "stages": lambda: stages.table(committed("stages")["profiles"]),
+    "step_parts": step_parts,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),
 }

@@ -9,7 +9,14 @@ import pytest
 
 from benchmarks import ewa, pictures, workloads
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
-from benchmarks.speed import frame_speed, growth, render_speed, splat_files, stages
+from benchmarks.speed import (
+    frame_speed,
+    growth,
+    render_speed,
+    splat_files,
+    stages,
+    step_parts,
+)
 from morgs_mi.core.bounded import read_json
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import make_sensor_camera
@@ -58,6 +65,14 @@ def test_render_speed__compares_with_other_programs(tmp_path):
     result = render_speed.figures(*workloads.ball(0, 60, 40, 24, 0.1), options)
     assert result["ratio_to_yardstick"] == pytest.approx(result["step_ms"] / 0.5, rel=1e-2)
     assert min(result["tenth_share"], result["volprim_step_ms"]) > 0
+
+
+@pytest.mark.slow
+def test_step_parts__leaves_out_each():
+    gaussians, camera = workloads.ball(0, 60, 40, 24, 0.1)
+    for part in ("", *step_parts.PARTS):
+        with step_parts.without(part):
+            assert render_speed.timed(step_parts.work(gaussians, camera, part)) > 0
 
 
 def test_splat_files__reports_times_and_sizes():
