@@ -137,7 +137,7 @@ def test_interruptible__lets_a_background_process_ignore_ctrl_c():
 STARTING = """
 import builtins, signal, sys
 sys.argv = ["/usr/bin/morgs-mi", "info", "nothing"]
-signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.{number}, signal.SIG_DFL)  # which nohup ignores
 load = builtins.__import__
 
 def interrupted(name, *args, **more):
