@@ -54,7 +54,10 @@ def draw_sweep(result: SweepResult) -> Figure:
                 rows = np.flatnonzero(np.array(result.arms) == name)
                 x, y = result.scores[rows][..., [1, k]].transpose(2, 0, 1)
                 panels[title][name] = x, y, np.array(result.epochs)[rows]
-    panels[_FIRST] = {"first frame": (*np.transpose(result.first_frames, (2, 1, 0)), ())}
+    # Seeds may balance exposures in different numbers of rounds, which come first.
+    count = min(len(curve) for curve in result.first_frames)
+    first_frames = [curve[-count:] for curve in result.first_frames]
+    panels[_FIRST] = {"first frame": (*np.transpose(first_frames, (2, 1, 0)), ())}
     lines = -(-len(panels) // 2)
     figure = Figure((_WIDTH, _HEIGHT * lines), layout="constrained")
     views = "held-out" if result.held_out else "training"
