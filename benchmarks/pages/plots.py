@@ -77,7 +77,7 @@ def growth() -> Figure:
         plot.plot(frames, [unit * frame[name] for frame in result["frames"]])
         first.set_ylabel(label)
         first.set_yticks(_TICKS, map(str, _TICKS))
-    columns[-1][0].set_title("basketball", fontsize=9)
+    columns[-1][0].set_title("one recording", fontsize=9)
     columns[-1][1].set_xlabel("frame")
     return figure
 
