@@ -149,9 +149,9 @@ def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened):
 
 
 def test_CameraFeed__refuses_images_of_different_times(opened):
-    feed, (a, b) = opened(1, 0, timeout=0.7)
+    feed, (a, b) = opened(1, 0, timeout=60)
     a.end()
-    Timer(0.6, b.deliver).start()
+    Timer(1.0, lambda: (b.deliver(), b.end())).start()
     with pytest.raises(
         ValueError, match=r"simultaneous images of cam0, cam1, got none that arrived within 0.5 s"
     ):
