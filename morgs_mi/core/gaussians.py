@@ -8,7 +8,7 @@ the number of Gaussians, K = (degree + 1)^2 the number of spherical harmonics (S
 from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, fields, replace
-from typing import Protocol
+from typing import Protocol, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,7 @@ from morgs_mi.core.attributes import (
 )
 from morgs_mi.core.checks import numbers, require
 from morgs_mi.core.memory import float_tensor
-from morgs_mi.core.types import Arrays, Float, Tensor, Tensors, UInt32
+from morgs_mi.core.types import Arrays, Bool, Float, Tensor, Tensors, UInt32
 
 
 class ActivatedGaussians(Protocol):
@@ -106,16 +106,50 @@ def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
 
     Args:
         tensor: D numbers in each of N rows.
-        index: UInt32 [M], none of them twice: every element is read once, and the adjoint needs no
-            atomics.
+        index: UInt32 [M], none of them twice.
     """
-    size = int(dr.prod(tensor.shape[1:]))
-    mode = dr.ReduceMode.NoConflicts
-    if size in (3, 4):  # four at a time are read as one packet
-        return list(
-            dr.gather(mi.Vector3f if size == 3 else mi.Vector4f, tensor.array, index, mode=mode)
+    return read_columns(tensor.array, index, int(dr.prod(tensor.shape[1:])))
+
+
+def read_columns(array: Float, index: UInt32, size: int, active: Bool | bool = True) -> list[Float]:
+    """Return rows of `size` numbers of a flat array, one float [M] per number, differentiable.
+
+    Args:
+        array: the rows, one after the other.
+        index: of the rows [M], none of them twice.
+        size: numbers in a row.
+        active: lanes that read; the others get zeros.
+    """
+    return dr.custom(_Columns, array, index, size, active)
+
+
+class _Columns(dr.CustomOp):
+    """Without it, the adjoint of each gather adds one lane after the other."""
+
+    def eval(self, array: Float, index: UInt32, size: int, active: Bool | bool) -> list[Float]:
+        self.width = dr.width(array)
+        self.active = active
+        # Four numbers are one packet in memory.
+        self.kind, count = (mi.Vector4f, size // 4) if size % 4 == 0 else (mi.Vector1f, size)
+        self.places = [index * count + j for j in range(count)]
+        return self._read(array)
+
+    def _read(self, array: Float) -> list[Float]:
+        packets = [dr.gather(self.kind, array, place, self.active) for place in self.places]
+        return [value for packet in packets for value in packet]
+
+    def backward(self) -> None:
+        grads = iter(cast(list[Float], self.grad_out()))
+        total = dr.zeros(mi.Float, self.width)
+        for place in self.places:
+            packet = self.kind(*(next(grads) for _ in range(dr.size_v(self.kind))))
+            dr.scatter(total, packet, place, self.active, mode=dr.ReduceMode.NoConflicts)
+        self.set_grad_in("array", total)
+
+    def forward(self) -> None:
+        self.set_grad_out(
+            self._read(dr.zeros(mi.Float, self.width) + cast(Float, self.grad_in("array")))
         )
-    return [dr.gather(mi.Float, tensor.array, index * size + k, mode=mode) for k in range(size)]
 
 
 def repeat_each(x: Float, count: int) -> Float:
@@ -380,14 +414,10 @@ def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:
         return sh_dc
     N = int(sh_dc.shape[0])
     K = int(sh_rest.shape[1]) + 1
-    # One gather per part: every element is read once, and the adjoint needs no atomics.
     lane = dr.arange(mi.UInt32, N * K * 3)
     row = lane // (3 * K)
     column = lane % (3 * K)
     is_dc = column < 3
-    mode = dr.ReduceMode.NoConflicts
-    coeffs = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
-    coeffs += dr.gather(
-        mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode
-    )
-    return mi.TensorXf(coeffs, (N, K, 3))
+    (dc,) = read_columns(sh_dc.array, row * 3 + column, 1, is_dc)
+    (rest,) = read_columns(sh_rest.array, row * (3 * K - 3) + column - 3, 1, ~is_dc)
+    return mi.TensorXf(dc + rest, (N, K, 3))

@@ -29,7 +29,7 @@ from annotated_types import Ge, Le
 
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.config import NonNegative, config_class
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, read_columns
 from morgs_mi.core.types import Arrays, Tensor, Tensors
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
@@ -72,11 +72,10 @@ def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int)
             pixels weigh little.
         num_pixels: of the whole view.
     """
-    lane = dr.arange(mi.UInt32, dr.width(motion) // 2) * 2
+    lane = dr.arange(mi.UInt32, dr.width(motion) // 2)
     x, y = (
-        dr.gather(mi.Float, motion.array, lane + k, mode=dr.ReduceMode.NoConflicts)
-        - elements(target.array, lane + k)
-        for k in range(2)
+        rendered - elements(target.array, 2 * lane + k)
+        for k, rendered in enumerate(read_columns(motion.array, lane, 2))
     )
     # A hundredth of a pixel keeps the derivative finite where both agree.
     total = dr.sum(dr.sqrt(x * x + y * y + 1e-4) * reliable.array)

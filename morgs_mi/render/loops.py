@@ -306,7 +306,7 @@ def adjoint(
         for g, v in zip(gradients, _load(block, layout, images), strict=True)
     ]
 
-    def body(walk, T, S, sums):
+    def body(walk, T, S):
         depth_order, walk = block.advance(walk)
         record = fetch_record(lists.records, depth_order, G + C)
         geometry = record[:G]
@@ -356,12 +356,12 @@ def adjoint(
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
             place = (first_record + depth_order) * packets + k
             dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, place, mode=mode)
-        return walk, T_next, S_next, sums
+        return walk, T_next, S_next
 
-    state = (block.walk, _floats(block.area, 1.0), suffix if geometric else [], sums)
-    return dr.while_loop(
-        state, lambda walk, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
-    )[-1]
+    # Without `sums` in the state: a recording would copy it once more.
+    state = (block.walk, _floats(block.area, 1.0), suffix if geometric else [])
+    dr.while_loop(state, lambda walk, T, _: block.continues(walk, T), body, label="blend (adjoint)")
+    return sums
 
 
 def _inner(g: list[Float], values: list[Float], layout: Layout, alpha: Float | None) -> Float:

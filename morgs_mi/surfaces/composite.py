@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.color_space import decode_traced, encode_traced
-from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.gaussians import ActivatedGaussians, read_columns
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Jit, Tensor
 from morgs_mi.render.channels import NORMALISED
@@ -122,15 +122,11 @@ def _in_front(
     index = from_numpy(mi.UInt32, index_image[pixels])
     has_surface = view.coverage > 0
 
-    def on_crop(image: Tensor) -> list[Float]:
-        size = image.shape[-1]
-        mode = dr.ReduceMode.NoConflicts
-        return [
-            dr.gather(mi.Float, image.array, index * size + k, active=has_surface, mode=mode)
-            for k in range(size)
-        ]
-
-    return _blended(part, channels, on_crop)
+    return _blended(
+        part,
+        channels,
+        lambda image: read_columns(image.array, index, image.shape[-1], has_surface),
+    )
 
 
 def _blended(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.attributes import ATTRIBUTES
-from morgs_mi.core.gaussians import Gaussians, join_sh, split_sh
+from morgs_mi.core.gaussians import Gaussians, join_sh, read_columns, split_sh
 from tests.scenes.derivatives import backward, gradient
 from tests.scenes.gaussians import make_scene, to_gaussians
 
@@ -25,6 +25,28 @@ def test_join_sh__inverts_split_sh_with_gradient(degree):
     assert np.array_equal(np.asarray(joined), np.asarray(sh))
     backward(dr.square(joined))
     assert gradient(sh) == pytest.approx(2 * np.asarray(sh), rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [3, 4])
+def test_read_columns__has_both_derivatives_beside_other_uses_of_the_array(size):
+    array = dr.linspace(mi.Float, 1, 2, 5 * size)
+    values = np.array(array).reshape(5, size)
+    index = mi.UInt32(3, 0, 1)
+    active = mi.Bool(True, True, False)
+    expected = np.ones((5, size))
+    expected[[3, 0]] += 2 * np.arange(1, size + 1) * values[[3, 0]]
+    for derivative in (dr.backward, dr.forward):
+        dr.enable_grad(array)
+        columns = read_columns(array, index, size, active)
+        assert np.array_equal(np.array(columns).T, values[[3, 0, 1]] * [[1], [1], [0]])
+        loss = sum((k + 1) * dr.sum(dr.square(column)) for k, column in enumerate(columns))
+        loss = loss + dr.sum(array)
+        derivative(loss if derivative is dr.backward else array)
+        if derivative is dr.backward:
+            assert gradient(array).reshape(5, size) == pytest.approx(expected, rel=1e-6)
+        else:
+            assert gradient(loss) == pytest.approx([expected.sum()], rel=1e-6)
+        dr.disable_grad(array)
 
 
 @pytest.mark.parametrize("degree", [0, 2])
