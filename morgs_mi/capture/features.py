@@ -77,13 +77,6 @@ class Tracks:
         """Number of tracks."""
         return int(self.ids.max(initial=-1)) + 1
 
-    def mean_colors(self) -> np.ndarray:
-        """Return the mean colour of each track [P, 3]."""
-        return (
-            np.stack([np.bincount(self.ids, band) for band in self.colors.T], axis=1)
-            / np.bincount(self.ids)[:, None]
-        )
-
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
     """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none
@@ -220,7 +213,9 @@ def triangulate(
     np.maximum.at(widest, tracks.ids, np.nan_to_num(angles))
     good = 2 * widest >= MIN_ANGLE
     good[tracks.ids[distances > max_error]] = False
-    return points[good].astype(np.float32), tracks.mean_colors()[good].astype(np.float32)
+    colors = np.stack([np.bincount(tracks.ids, band) for band in tracks.colors.T], axis=1)
+    colors /= np.bincount(tracks.ids)[:, None]
+    return points[good].astype(np.float32), colors[good].astype(np.float32)
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:

@@ -147,9 +147,7 @@ class _Columns(dr.CustomOp):
         self.set_grad_in("array", total)
 
     def forward(self) -> None:
-        self.set_grad_out(
-            self._read(dr.zeros(mi.Float, self.width) + cast(Float, self.grad_in("array")))
-        )
+        self.set_grad_out(self._read(cast(Float, self.grad_in("array"))))
 
 
 def repeat_each(x: Float, count: int) -> Float:

@@ -56,42 +56,46 @@ class Planes:
         """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see
         `memory.owned_copy`).
         """
+        target = dr.empty(mi.Float, self.size)
+        strip, y, places = self._strips(self.num_columns * COLUMN)
+        strip = strip - _SPARE
         if self.width % STRIP == 0:
-            target = dr.empty(mi.Float, self.size)
-            strip, y, places = self._strips(self.num_columns * COLUMN)
-            strip = strip - _SPARE
             strips = dr.opaque(mi.UInt32, self.num_strips)
             reads = [
                 read_packet(image, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)
             ]
             values = [v for read in reads for v in read]
-            for component, place in enumerate(places):
-                write_packet(target, values[component::3], place)
-            return target
-        lane = dr.arange(mi.UInt32, self.size)
-        line = lane // (COLUMN * STRIP)
-        x = lane % (COLUMN * STRIP)
-        column, y = quotient_and_rest(line, self.height)
-        component, column = quotient_and_rest(column, self.num_columns)
-        x += column * (COLUMN * STRIP) - _SPARE * STRIP
-        width = dr.opaque(mi.UInt32, self.width)
-        return dr.gather(mi.Float, image, (y * width + x) * 3 + component, active=x < width)
+        else:
+            values = [
+                dr.gather(mi.Float, image, place, active=valid)
+                for place, valid in self._numbers(strip, y)
+            ]
+        for component, place in enumerate(places):
+            write_packet(target, values[component::3], place)
+        return target
 
     def image(self, planes: Float) -> Float:
         """Return the flat image [H * W * 3] of planes."""
+        target = dr.empty(mi.Float, 3 * self.height * self.width)
+        strip, y, places = self._strips(self.num_strips, _SPARE)
+        rows = zip(*(read_packet(planes, place) for place in places), strict=True)
+        values = [v for pixel in rows for v in pixel]
         if self.width % STRIP == 0:
-            target = dr.empty(mi.Float, 3 * self.height * self.width)
-            strip, y, places = self._strips(self.num_strips, _SPARE)
-            rows = zip(*(read_packet(planes, place) for place in places), strict=True)
-            values = [v for pixel in rows for v in pixel]
             for k in range(3):
                 lane = 3 * (y * dr.opaque(mi.UInt32, self.num_strips) + strip) + k
                 write_packet(target, values[STRIP * k : STRIP * (k + 1)], lane)
-            return target
-        lane = dr.arange(mi.UInt32, 3 * self.height * self.width)
-        pixel = lane // 3
-        y, x = quotient_and_rest(pixel, self.width)
-        return elements(planes, self._place(lane - 3 * pixel, y, x))
+        else:
+            for value, (place, valid) in zip(values, self._numbers(strip, y), strict=True):
+                mode = dr.ReduceMode.NoConflicts
+                dr.scatter(target, value, place, active=valid, mode=mode)
+        return target
+
+    def _numbers(self, strip: UInt32, y: UInt32) -> list[tuple[UInt32, Bool]]:
+        """Return (place in the flat image, in the view) of each number of a strip of a row."""
+        width = dr.opaque(mi.UInt32, self.width)
+        x = strip * STRIP
+        first = 3 * (y * width + x)
+        return [(first + k, x + k // 3 < width) for k in range(3 * STRIP)]
 
     def _strips(self, count: int, first: int = 0) -> tuple[UInt32, UInt32, list[UInt32]]:
         """Return (strip, row) of `count` strips of every row, and the place of strip `first` +

@@ -131,18 +131,14 @@ class SegmentNetwork:
         return objects
 
 
-def prompts(
-    component: np.ndarray, count: int = 3, spacing: float = 0.25
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return SAM2's prompt for the object under a connected component: its box and a few points
-    deep inside it.
+def prompts(component: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return SAM2's prompt for the object under a connected component: its box and up to three
+    points deep inside it.
 
-    Each point is the deepest one that is not too near to the others.
+    Each point is the deepest one at least a quarter of the box's longer side from the others.
 
     Args:
         component: [H, W] bool, not empty.
-        count: most points.
-        spacing: least distance between them, in longer sides of the box.
 
     Returns:
         Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P],
@@ -151,11 +147,11 @@ def prompts(
     columns, rows = (np.flatnonzero(component.any(axis)) for axis in range(2))
     upper_left = (columns[0], rows[0])
     lower_right = (columns[-1] + 1, rows[-1] + 1)
-    distance = max(np.subtract(lower_right, upper_left)) * spacing
+    distance = max(np.subtract(lower_right, upper_left)) / 4
     depth = cv2.distanceTransform(np.pad(component, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     y, x = np.mgrid[: component.shape[0], : component.shape[1]]
     points = []
-    while len(points) < count and depth.any():
+    while len(points) < 3 and depth.any():
         row, column = np.unravel_index(np.argmax(depth), depth.shape)
         points.append((column + 0.5, row + 0.5))
         depth = np.where(np.hypot(x - column, y - row) < distance, 0, depth)
