@@ -268,7 +268,7 @@ class Drawing:
         splats, lists = self.drawn
         with dr.suspend_grad():
             columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
-            records = pack_records([*splats.geometry, *columns], lists.by_depth_order)
+            records = pack_records([*splats.geometry, *columns], lists.depth_order_of)
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
             grads = record_gradients(replace(lists, records=records), layout, [image], [image])
             place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after

@@ -44,7 +44,6 @@ class BlockLists:
     first: UInt32  #: First entry of its tile [A].
     order: UInt32  #: Blocks by falling count, roughly [A]: the lanes of a packet finish together.
     depth_order_of: UInt32  #: Of each splat [N].
-    by_depth_order: UInt32  #: Splats by depth order [N].
     # Of each block [A], see `Region`.
     x: UInt32
     y: UInt32
@@ -82,7 +81,7 @@ def build_lists(
     dr.eval(rectangles)
     tiles = _tile_lists([elements(v, by_depth_order) for v in rectangles], region)
 
-    records = pack_records([*splats.geometry, *columns], by_depth_order)
+    records = pack_records([*splats.geometry, *columns], depth_order_of)
     geometry = fetch_record(
         records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N)
     )
@@ -106,7 +105,6 @@ def build_lists(
         first,
         order,
         depth_order_of,
-        by_depth_order,
         *(region.x, region.y, region.place, region.rows, region.pitch),
         None if limits is None else on_region(limits, region),
     )
@@ -137,21 +135,20 @@ def next_entry(
     )
 
 
-def pack_records(columns: list[Float], order: UInt32) -> Float:
-    """Return the columns [N] interleaved to one record per Gaussian, in the given order, padded to
-    4 floats.
+def pack_records(columns: list[Float], depth_order_of: UInt32) -> Float:
+    """Return the columns [N] interleaved to one record per Gaussian, by depth order, padded to 4
+    floats.
 
     Records are read in packets of 4 floats, one cache line or less for each Gaussian.
     """
-    N = dr.width(order)
+    N = dr.width(depth_order_of)
     width = -(-len(columns) // 4)
-    values = [elements(column, order) for column in columns]
-    values += [mi.Float(0)] * (4 * width - len(values))
+    values = columns + [mi.Float(0)] * (4 * width - len(columns))
     records = dr.empty(mi.Float, 4 * width * N)
-    lane = dr.arange(mi.UInt32, N) * width
+    place = depth_order_of * width
     for j in range(width):
         packet = mi.Vector4f(*values[4 * j : 4 * j + 4])
-        dr.scatter(records, packet, lane + j, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(records, packet, place + j, mode=dr.ReduceMode.NoConflicts)
     dr.eval(records)
     return records
 

@@ -81,7 +81,7 @@ class _Blend(dr.CustomOp):
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         grads = grads[: self.layout.geometry + self.layout.columns]
-        tangents = pack_records(grads, self.lists.by_depth_order)
+        tangents = pack_records(grads, self.lists.depth_order_of)
         images = recorded(tangent, self.layout)(self.lists, tangents, self._allocated())
         self.set_grad_out(self._outputs(images))
 
@@ -115,7 +115,7 @@ def record_gradients(
         images: flat image of each channel on the region.
         grads: their gradients.
     """
-    N = dr.width(lists.by_depth_order)
+    N = dr.width(lists.depth_order_of)
     stride = 4 * record_packets(layout)
     num_blocks = dr.width(lists.order)
     launches, num_sections, lanes = sections(num_blocks)
