@@ -214,8 +214,8 @@ def triangulate(
     good = 2 * widest >= MIN_ANGLE
     good[tracks.ids[distances > max_error]] = False
     colors = np.stack([np.bincount(tracks.ids, band) for band in tracks.colors.T], axis=1)
-    colors /= np.bincount(tracks.ids)[:, None]
-    return points[good].astype(np.float32), colors[good].astype(np.float32)
+    colors = (colors / np.bincount(tracks.ids)[:, None])[good]
+    return points[good].astype(np.float32), colors.astype(np.float32)
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:

@@ -66,10 +66,7 @@ class Planes:
             ]
             values = [v for read in reads for v in read]
         else:
-            values = [
-                dr.gather(mi.Float, image, place, active=valid)
-                for place, valid in self._numbers(strip, y)
-            ]
+            values = [dr.gather(mi.Float, image, *number) for number in self._numbers(strip, y)]
         for component, place in enumerate(places):
             write_packet(target, values[component::3], place)
         return target
@@ -86,8 +83,7 @@ class Planes:
                 write_packet(target, values[STRIP * k : STRIP * (k + 1)], lane)
         else:
             for value, (place, valid) in zip(values, self._numbers(strip, y), strict=True):
-                mode = dr.ReduceMode.NoConflicts
-                dr.scatter(target, value, place, active=valid, mode=mode)
+                dr.scatter(target, value, place, valid, mode=dr.ReduceMode.NoConflicts)
         return target
 
     def _numbers(self, strip: UInt32, y: UInt32) -> list[tuple[UInt32, Bool]]:

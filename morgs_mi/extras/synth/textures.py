@@ -46,10 +46,27 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np
     return np.clip(checker * np.exp(0.35 * shade + 0.10 * tint), 0.03, 0.85).astype(np.float32)
 
 
-def textured(texture: np.ndarray) -> dict[str, Any]:
-    """Return a diffuse Mitsuba material with a texture, a reflectance [size, size, 3], linear."""
-    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True}
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap}}
+def textured(
+    texture: np.ndarray, roughness: float | None = None, repeat: tuple[float, float] = (1, 1)
+) -> dict[str, Any]:
+    """Return a textured Mitsuba material, diffuse or rough plastic.
+
+    Args:
+        texture: reflectance [size, size, 3], linear.
+        roughness: roughness of the plastic; None for diffuse.
+        repeat: repetitions of the texture along u and v, which avoid stretching on long, thin
+            shapes.
+    """
+    to_uv = mi.ScalarTransform4f().scale([*repeat, 1])
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True, "to_uv": to_uv}
+    if roughness is None:
+        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap}}
+    return {
+        "type": "roughplastic",
+        "diffuse_reflectance": bitmap,
+        "alpha": roughness,
+        "specular_reflectance": 0.5,
+    }
 
 
 def room(
