@@ -128,21 +128,26 @@ class _Columns(dr.CustomOp):
 
     def eval(self, array: Float, index: UInt32, size: int, active: Bool | bool) -> list[Float]:
         self.width = dr.width(array)
+        self.index = index
+        self.size = size
         self.active = active
-        # Four numbers are one packet in memory.
-        self.kind, count = (mi.Vector4f, size // 4) if size % 4 == 0 else (mi.Vector1f, size)
-        self.places = [index * count + j for j in range(count)]
         return self._read(array)
 
     def _read(self, array: Float) -> list[Float]:
-        packets = [dr.gather(self.kind, array, place, self.active) for place in self.places]
-        return [value for packet in packets for value in packet]
+        # Not in packets: memory that is borrowed from NumPy may not be aligned to them.
+        return [
+            dr.gather(mi.Float, array, self.index * self.size + k, self.active)
+            for k in range(self.size)
+        ]
 
     def backward(self) -> None:
-        grads = iter(cast(list[Float], self.grad_out()))
+        grads = cast(list[Float], self.grad_out())
         total = dr.zeros(mi.Float, self.width)
-        for place in self.places:
-            packet = self.kind(*(next(grads) for _ in range(dr.size_v(self.kind))))
+        kind, step = (mi.Vector4f, 4) if self.size % 4 == 0 else (mi.Vector1f, 1)
+        count = self.size // step
+        for j in range(count):
+            packet = kind(*grads[step * j : step * (j + 1)])
+            place = self.index * count + j
             dr.scatter(total, packet, place, self.active, mode=dr.ReduceMode.NoConflicts)
         self.set_grad_in("array", total)
 
