@@ -7,6 +7,7 @@ import threading
 from itertools import pairwise
 from unittest.mock import Mock
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -424,15 +425,21 @@ def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip, first
     assert loop.state.frame == 3
 
 
+def is_array(value):
+    return dr.is_array_v(value) or isinstance(value, np.ndarray)
+
+
 def garbage_of(action):
-    """Return what only a garbage collection frees after an action."""
+    """Return what holds arrays that only a garbage collection frees after an action; other threads
+    may leave other things in the meantime.
+    """
     gc.collect()
     gc.disable()
     gc.set_debug(gc.DEBUG_SAVEALL)
     try:
         action()
         gc.collect()
-        return list(gc.garbage)
+        return [thing for thing in gc.garbage if any(map(is_array, gc.get_referents(thing)))]
     finally:
         gc.set_debug(0)
         gc.garbage.clear()
