@@ -425,10 +425,6 @@ def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip, first
     assert loop.state.frame == 3
 
 
-def is_array(value):
-    return dr.is_array_v(value) or isinstance(value, np.ndarray)
-
-
 def garbage_of(action):
     """Return what holds arrays that only a garbage collection frees after an action; other threads
     may leave other things in the meantime.
@@ -439,7 +435,11 @@ def garbage_of(action):
     try:
         action()
         gc.collect()
-        return [thing for thing in gc.garbage if any(map(is_array, gc.get_referents(thing)))]
+        return [
+            thing
+            for thing in gc.garbage
+            if any(dr.is_array_v(x) or isinstance(x, np.ndarray) for x in gc.get_referents(thing))
+        ]
     finally:
         gc.set_debug(0)
         gc.garbage.clear()
