@@ -23,7 +23,7 @@ from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_points, few
+from morgs_mi.core.checks import check_points, composed, few
 from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.files import CAPTURE
 from morgs_mi.core.rig import with_near_planes
@@ -367,7 +367,7 @@ def load_capture(
     reader = find_reader(path)
     every = reader.read(path).centred(path)
     calibration = every.without(path, reading.without)
-    readers = open_clips(calibration.clips, reading.gaps)
+    readers = open_clips(calibration.clips, reading.gaps, settings.get("white"))
     recorded = _at_clip_sizes(path, calibration.cameras, readers)
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
@@ -379,6 +379,7 @@ def load_capture(
     if not isinstance(readouts, dict):
         readouts = dict.fromkeys(names, readouts)
     check_names(path / CAPTURE, "readout", readouts, every.names)
+    readouts = {composed(name): readout for name, readout in readouts.items()}
     readouts = [readouts.get(name, 0.0) for name in names]
     cameras = _downscaled_cameras(recorded, downscale, common.clips, readouts)
     cameras = with_near_planes(cameras, calibration.points, reading.near)

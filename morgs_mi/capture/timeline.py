@@ -27,7 +27,7 @@ import numpy as np
 
 from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.core.bounded import read_json, warn_unread
-from morgs_mi.core.checks import check_number
+from morgs_mi.core.checks import check_number, composed, few
 from morgs_mi.core.config import config_class
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.video import FolderReader, FrameReader
@@ -37,6 +37,7 @@ _DEFAULT_FPS = 30.0
 _INTERVALS = {
     "fps": "[1e-6, 1e6]",
     "display_exposure": "[-100, 100]",
+    "white": "[1, 65535]",
 }
 _SETTINGS = {*_INTERVALS, "test_view", "readout"}
 # Distance in frames up to which a frame shows a timestamp.
@@ -112,7 +113,11 @@ def timeline(
             camera or has an offset that is not finite.
     """
     check_names(path, "offset", config.offset, names)
+    config = replace(config, offset={composed(name): o for name, o in config.offset.items()})
     exact, notes = _by_numbers(path, names, readers, config, _clocks(names, readers, config, fps))
+    notes += _notes_of_clips(names, readers)
+    if not config.offset:
+        notes += _time_codes(names, readers)
     for note in notes:
         _LOG.warning("%s: %s", path, note)
     if config.trim or config.offset:
@@ -223,6 +228,32 @@ def _by_numbers(
         # The time between two timestamps, in frames of the clip with the most frames per time.
         clocks.fps / (lcm(*steps) / min(steps)),
     ), notes
+
+
+def _notes_of_clips(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
+    """Return the notes of the clips, each with the cameras that have it."""
+    cameras: dict[str, list[str]] = {}
+    for name, reader in zip(names, readers, strict=True):
+        for note in reader.notes:
+            cameras.setdefault(note, []).append(name)
+    return [f"{few(cameras[note])}: {note}" for note in cameras]
+
+
+def _time_codes(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
+    """Return a sentence if overlapping clips began at different times by their time codes."""
+    if any(reader.start is None for reader in readers):
+        return []
+    fps = np.array([reader.fps for reader in readers], float)
+    starts = np.array([reader.start for reader in readers], float)
+    lengths = np.array([reader.num_frames for reader in readers]) / fps
+    offsets = np.rint((starts[0] - starts) * fps)
+    if np.ptp(starts) >= lengths.min() or not offsets.any():
+        return []
+    moved = [f"{name} {offset:g}" for name, offset in zip(names, offsets, strict=True) if offset]
+    return [
+        f"The time codes of the clips begin up to {np.ptp(starts):.3g} s apart; if they were "
+        f"synchronised, align the clips with --offset {' '.join(moved)}."
+    ]
 
 
 def _table(names: Sequence[str], numbers: Mapping[int, range], group: Sequence[int]) -> str:
@@ -399,7 +430,8 @@ def read_settings(path: Path) -> dict[str, Any]:
 
     They are ``fps``, ``test_view`` and ``readout``, the frames from the exposure of an image's
     first row to the exposure of its last row: a number for all cameras, or an object with the
-    numbers that are not 0, by the cameras' names; and ``display_exposure`` in stops, see `Capture`.
+    numbers that are not 0, by the cameras' names; ``display_exposure`` in stops, see `Capture`; and
+    ``white``, its value in images of 16 bits.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from numbers import Real
@@ -137,13 +138,23 @@ def view_index(place: object, setting: str, view: Any, names: Sequence[str]) -> 
     Raises:
         ValueError: there is no such view.
     """
-    index = names.index(view) if view in names else view
+    names = list(map(composed, names))
+    name = composed(view) if isinstance(view, str) else view
+    index = names.index(name) if name in names else view
     if str(index).isdecimal() and int(index) < len(names):
         return int(index)
     raise ValueError(
         f"{place}: {setting} must be an index in 0..{len(names) - 1} or one of {', '.join(names)}, "
         f"got {view!r}."
     )
+
+
+def composed(name: str) -> str:
+    """Return a name in Unicode's composed form (NFC), in which names are compared.
+
+    Files copied from macOS have decomposed names: a letter, then its accent.
+    """
+    return unicodedata.normalize("NFC", name)
 
 
 def few(names: Sequence[Any] | np.ndarray, most: int = 10) -> str:

@@ -1,6 +1,8 @@
-"""The clock of a video's frames, from their times."""
+"""The clock of a video's frames, from their times, and the time codes of clips."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 
@@ -38,3 +40,24 @@ def true_rate(fps: float, frames: float, duration: float) -> float:
     # rounded.
     difference = abs(fps * duration - frames)
     return fps if not duration or difference <= _JITTER + _ROUNDING * fps else frames / duration
+
+
+def time_code_seconds(text: str, fps: float) -> float | None:
+    """Return the time of an SMPTE time code ``hh:mm:ss:ff``, s, or None for another text.
+
+    With a semicolon before the frame, two of 30 frame numbers (four of 60) are dropped in every
+    minute except each tenth one, so that the time code follows the clock at 29.97 fps.
+
+    Args:
+        text: the time code.
+        fps: frames per second.
+    """
+    match = re.fullmatch(r"(\d+):(\d+):(\d+)([:;.])(\d+)", text)
+    if match is None or not fps:
+        return None
+    hours, minutes, seconds, frame = map(int, match.group(1, 2, 3, 5))
+    minutes += 60 * hours
+    count = (60 * minutes + seconds) * round(fps) + frame
+    if match[4] != ":":
+        count -= round(fps / 15) * (minutes - minutes // 10)
+    return count / fps

@@ -4,7 +4,10 @@ files.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+
+from morgs_mi.core.checks import composed
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
@@ -58,3 +61,19 @@ def images_in(folder: str | Path) -> list[Path]:
     files = listed(folder)
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
     return images or [file for file in files if file.suffix.lower() == EXR_SUFFIX]
+
+
+def by_stem(files: Iterable[Path]) -> dict[str, Path]:
+    """Return files by their names without suffix, composed.
+
+    Raises:
+        ValueError: two have the same, such as an image and its mask.
+    """
+    files_by_stem: dict[str, Path] = {}
+    for file in files:
+        if (other := files_by_stem.setdefault(composed(file.stem), file)) != file:
+            raise ValueError(
+                f"{file.parent}: expected one file of each name, got {other.name} and {file.name}; "
+                "move masks and other copies into a folder outside of it."
+            )
+    return files_by_stem

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,48 +38,77 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     name, or the last one, as in ``cam1_0000``, ``0000_cam1`` and ``0000``.
 
     Of several that change, it is the one with the most values, then with the fewest gaps, then the
-    last one. A single name without a number has the number 0.
+    last one. It must order the frames as their names do: that of a time code does not, because it
+    begins again with every second. A single name without a number has the number 0.
 
     Args:
         folder: the folder of the frames, for messages.
         names: names without suffixes.
 
     Raises:
-        ValueError: a name has no number, or two have the same.
+        ValueError: a name has no number, two have the same, or the names have another order.
     """
     numbers = [list(map(int, reversed(re.findall(r"[0-9]+", name)))) for name in names]
     columns = list(zip(*numbers, strict=False)) if len(names) > 1 or any(numbers) else [(0,)]
     if not columns:
         name = names[numbers.index([])]
         raise ValueError(f"{folder}: expected a number in each name, got {name}; rename it.")
-    best = min(
-        columns,
-        key=lambda column: (
-            -len({*column}),
-            (max(column) - min(column)) // (math.gcd(*(n - column[0] for n in column)) or 1),
-        ),
-    )
-    last = dict(zip(best, names, strict=True))
-    for number, name in zip(best, names, strict=True):
-        if last[number] != name:
+    best = min(columns, key=lambda column: (-len({*column}), _num_gaps(column)))
+    in_order = sorted(zip(map(natural_key, names), best, names, strict=True))
+    for (_, number, name), (_, next_number, next_name) in pairwise(in_order):
+        if number >= next_number:
             raise ValueError(
-                f"{folder}: expected one file of number {number}, got {name} and "
-                f"{last[number]}; remove one."
+                f"{folder}: expected one number in each name that counts the frames, got {name} "
+                f"followed by {next_name}; rename the images to 0000, 0001, ... if their names are "
+                "times, or move away those that are no frames of this clip."
             )
     return list(best)
 
 
+def natural_key(name: str) -> list[str | int]:
+    """Return a sorting key that places cam_2 before cam_10."""
+    # split() with a group alternates text and digits, so keys compare text with text and int with
+    # int.
+    return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
+
+
 def check_numbering(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> None:
-    """Raise an error unless the numbers of a folder's frames ascend in equal steps.
+    """Raise an error unless the numbers of a folder's frames are in equal steps.
+
+    Args:
+        folder: the folder, for messages.
+        numbers: in ascending order.
+        names: of the frames.
 
     Raises:
-        ValueError: they do not; the sentence has the `names` before and behind the gap.
+        ValueError: they are not; the sentence has the `names` before and behind the gap.
+    """
+    check_counting(folder, numbers, names)
+    steps = np.diff(numbers)
+    if len(gaps := np.flatnonzero(steps > min(steps, default=1))):
+        raise ValueError(
+            f"{folder}: the frames must be numbered without gaps, got {names[gaps[0]]} followed by "
+            f"{names[gaps[0] + 1]}; extract them again, or go on without the missing ones (--gaps)."
+        )
+
+
+def check_counting(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> None:
+    """Raise an error unless the ascending numbers of a folder's frames count in multiples of their
+    smallest step, as times in milliseconds do not.
+
+    Raises:
+        ValueError: they do not.
     """
     steps = np.diff(numbers)
     least = min(steps, default=1)
-    if least < 1 or (steps != least).any():
-        gap = int(np.argmax(steps != least) if least > 0 else np.argmin(steps))
+    if len(uneven := np.flatnonzero(steps % least)):
         raise ValueError(
-            f"{folder}: the frames must be numbered without gaps, got {names[gap]} followed by "
-            f"{names[gap + 1]}; extract them again, or go on without the missing ones (--gaps)."
+            f"{folder}: expected numbers that count the frames in equal steps, got "
+            f"{names[uneven[0]]} followed by {names[uneven[0] + 1]}, and steps of {least} between "
+            "others; rename the images to 0000, 0001, ... if their names are times."
         )
+
+
+def _num_gaps(numbers: Sequence[int]) -> int:
+    step = math.gcd(*(number - numbers[0] for number in numbers)) or 1
+    return (max(numbers) - min(numbers)) // step

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -26,21 +25,37 @@ import imagesize
 import numpy as np
 
 from morgs_mi.core.bounded import check_claim
+from morgs_mi.core.checks import errors_at, few
 from morgs_mi.io.exr import read_light
-from morgs_mi.io.frame_times import clock, true_rate
-from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, existing_file, images_in
-from morgs_mi.io.numbering import check_numbering, counting_together, frame_numbers
+from morgs_mi.io.frame_times import clock, time_code_seconds, true_rate
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
+from morgs_mi.io.numbering import (
+    check_counting,
+    check_numbering,
+    counting_together,
+    frame_numbers,
+    natural_key,
+)
 
 if TYPE_CHECKING:
     import av  # imported where a video is opened, as it takes 80 ms
     import av.container
+    from av.video.reformatter import VideoReformatter
 
 _Item = TypeVar("_Item")
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
-# White of images of 16 bits, and the bits of cameras that are stored in them.
-_WHITE = 2**16 - 1
-_BITS = (8, 10, 12, 14)
+WHITE = 2**16 - 1
+"""White of images of 16 bits, unless a capture sets another one."""
+# FFmpeg's readers of videos. None of them opens the files that a text names, as that of play lists
+# does.
+_CONTAINERS = {
+    "format_whitelist": "mov,matroska,avi,mpegts,mpeg,flv",
+    "protocol_whitelist": "file",
+}
+# Colours that are not converted, by their codes in ITU-T H.273.
+_TRANSFERS = {16: "PQ", 18: "HLG"}
+_PRIMARIES = {9: "BT.2020", 12: "Display P3"}
 # What a file is expected to be, and the remedy if there is none.
 _IMAGE = ("an image", "extract the frames again, or go on without it (--gaps)")
 _LOG = logging.getLogger(__name__)
@@ -51,13 +66,6 @@ FAR = 100
 _BEFORE = 32
 # Frames that a clip may pause; the timestamps of the pause are listed.
 _MAX_PAUSE = 1_000_000
-
-
-def natural_key(name: str) -> list[str | int]:
-    """Return a sorting key that places cam_2 before cam_10."""
-    # split() with a group alternates text and digits, so keys compare text with text and int with
-    # int.
-    return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
 
 
 class _Frames:
@@ -91,7 +99,7 @@ class VideoReader(_Frames):
     path: Path  #: The file.
     num_frames: int  #: Number of frames according to the file's header.
     fps: float | None  #: Frames per second, None if unknown.
-    width: int  #: In pixels, after the rotation that the file asks for.
+    width: int  #: In pixels, after the rotation that the file requires.
     height: int  #: In pixels.
     num_held: int  #: Number of frames in the file; less than `num_frames` if it was truncated.
     #: Times of the frames in the file, in frames of a regular clock of rate `fps`, which shows
@@ -103,6 +111,10 @@ class VideoReader(_Frames):
     stamps: np.ndarray | None = field(default=None, compare=False, repr=False)
     #: Times of the frames after the first, s [num_held]; None if the file does not store them.
     times: np.ndarray | None = field(default=None, compare=False, repr=False)
+    start: float | None = None  #: Time code of the first frame, s; None if there is none.
+    most: int | None = None  #: As of `FolderReader`.
+    white: int = WHITE  #: As of `FolderReader`.
+    notes: tuple[str, ...] = ()  #: A sentence for each property of the file that is not used.
     has_light: ClassVar[bool] = False
 
     @classmethod
@@ -126,7 +138,8 @@ class VideoReader(_Frames):
                     packets.append((packet.pts, packet.is_discard, packet.is_corrupt))
             if first is None:
                 raise _unreadable(path, "no frame can be decoded")
-            width, height = (first.width, first.height)[:: 1 if first.rotation % 180 == 0 else -1]
+            with errors_at(path):
+                height, width = _shown(np.empty((first.height, first.width)), first).shape
             fps = float(stream.guessed_rate or 0)
             shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
             # Without stamps, if a packet has none, or two have the same.
@@ -140,6 +153,16 @@ class VideoReader(_Frames):
                 num_frames = num_held  # headers also count what edit lists and null frames hide
             length = _length(container, stream, first)
             unit = float(stream.time_base or 0)
+            # AVI has no others; of some codecs, FFmpeg finds those of the frames.
+            are_of_decoding = (
+                container.format.name == "avi"
+                and stream.codec_context.has_b_frames
+                and shown == sorted(shown, key=lambda time: time or 0)
+            )
+            start = time_code_seconds(_time_code(container), fps)
+            is_deep = max(part.bits for part in first.format.components) == 16
+            most = int(first.to_ndarray(format="rgb48le").max()) if is_deep else None
+            notes = tuple(_unused_properties(container, stream, first))
         positions = times = None
         if stamps is not None and num_held > 1:
             times = (stamps - stamps[0]) * unit
@@ -158,7 +181,21 @@ class VideoReader(_Frames):
                 num_frames = round(length * fps)
         if not num_held <= num_frames <= path.stat().st_size:  # a frame takes more than a byte
             num_frames = num_held
-        return cls(path, num_frames, fps or None, width, height, num_held, positions, stamps, times)
+        return cls(
+            path,
+            num_frames,
+            fps or None,
+            width,
+            height,
+            num_held,
+            positions,
+            # Decoded frames are in order, but have each other's times.
+            None if are_of_decoding else stamps,
+            times,
+            start,
+            most,
+            notes=notes,
+        )
 
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
         """Yield the frames of ascending `indices`, with an error in place of each that cannot be
@@ -188,19 +225,32 @@ class VideoReader(_Frames):
                         f"{missing} frames (`max_frames`)."
                     )
                     continue
-                # Of 10 bits, BGR has half the error of RGB. Starting threads takes 1 ms a frame.
-                bgr = converter.reformat(
-                    frame, format="bgr24", interpolation="BICUBIC", threads=1
-                ).to_ndarray()
-                image = cv2.cvtColor(np.rot90(bgr, frame.rotation // 90), cv2.COLOR_BGR2RGB)
-                yield (
-                    image
-                    if image.shape[:2] == (self.height, self.width)
-                    else ValueError(
-                        f"{self.path}: frame {target}: expected {self.width}x{self.height}, "
-                        f"got {image.shape[1]}x{image.shape[0]}; convert the clip to one size."
-                    )
-                )
+                try:
+                    image = self._image(frame, converter)
+                except ValueError as error:
+                    image = ValueError(f"{self.path}: frame {target}: {error}.")
+                yield image
+
+    def _image(self, frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
+        """Return the RGB image [H, W, 3] uint8 of a frame, as players show it.
+
+        Raises:
+            ValueError: it has another size than the first one, or brighter values than white.
+        """
+        # Of 10 bits, BGR has half the error of RGB. Starting threads takes 1 ms a frame.
+        bgr = converter.reformat(
+            frame,
+            format="bgr24" if self.most is None else "bgr48le",
+            interpolation="BICUBIC",
+            threads=1,
+        ).to_ndarray()
+        image = cv2.cvtColor(_shown(_eight_bits(bgr, self.white), frame), cv2.COLOR_BGR2RGB)
+        if image.shape[:2] != (self.height, self.width):
+            raise ValueError(
+                f"expected {self.width}x{self.height}, got {image.shape[1]}x{image.shape[0]}; "
+                "convert the clip to one size"
+            )
+        return image
 
     def _numbered(self, first: int) -> Generator[tuple[int, av.VideoFrame], None, None]:
         """Yield the frames with their indices, from `first` or earlier."""
@@ -233,12 +283,13 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoS
 
     existing_file(path, "a video file")
     try:
-        container = av.open(f"file:{path}")  # a colon in the path would name a protocol
+        # A colon in the path would name a protocol.
+        container = av.open(f"file:{path}", options=_CONTAINERS)
     except FFmpegError as error:
         raise _unreadable(path, str(error.strerror)) from None
     with container:
-        stream = container.streams.best("video")
-        if not isinstance(stream, av.VideoStream) or stream.codec_context is None:
+        stream = next(iter(_tracks(container)), None)
+        if stream is None or stream.codec_context is None:
             raise _unreadable(path, "it has no images, or FFmpeg has no decoder for its codec")
         stream.thread_type = "AUTO"
         yield container, stream
@@ -267,6 +318,78 @@ def _length(
     return end - (first.time or 0) if np.isfinite(end) else 0
 
 
+def _tracks(container: av.container.InputContainer) -> list[av.VideoStream]:
+    """Return the tracks of images, of which players show the first, without cover pictures."""
+    from av.stream import Disposition
+
+    pictures = Disposition.attached_pic
+    return [track for track in container.streams.video if not track.disposition & pictures]
+
+
+def _time_code(container: av.container.InputContainer) -> str:
+    """Return the time code of a clip's first frame, or an empty text."""
+    metadata = [container.metadata, *(track.metadata for track in container.streams)]
+    codes = (tags.get("timecode") or tags.get("TIMECODE") for tags in metadata)
+    return next(filter(None, codes), "")
+
+
+def _unused_properties(
+    container: av.container.InputContainer, stream: av.VideoStream, frame: av.VideoFrame
+) -> Iterator[str]:
+    """Yield a sentence for each property of a video that is not used: other tracks, interlaced
+    rows, and colours other than sRGB's.
+    """
+    used, *others = (
+        track.metadata.get("title") or track.codec.name for track in _tracks(container)
+    )
+    if others:
+        yield f"the first video track, {used}, is used, and not {', '.join(others)}."
+    if frame.interlaced_frame:
+        yield (
+            "interlaced: each frame has the rows of two moments; deinterlace the clip (FFmpeg's "
+            "filter bwdif) if things move."
+        )
+    names = (_TRANSFERS.get(frame.color_trc), _PRIMARIES.get(frame.color_primaries))
+    if colors := " and ".join(filter(None, names)):
+        yield f"colours of {colors} are used as those of sRGB; convert the clip to BT.709."
+
+
+def _shown(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
+    """Return a frame's image [H, W, ...] turned and mirrored as its display matrix requires.
+
+    Raises:
+        ValueError: the matrix turns it by another angle than 90 degrees.
+    """
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return image
+    # Of (x, y) to (ax + cy, bx + dy), in units of 2^-16.
+    (a, b, _), (c, d, _), _ = np.rint(np.frombuffer(matrix, np.int32).reshape(3, 3) / 2**16)
+    if {abs(a), abs(b)} != {0, 1} or (abs(c), abs(d)) != (abs(b), abs(a)):
+        raise ValueError(
+            "expected a display matrix that mirrors or turns by 90, 180 or 270 degrees, got "
+            f"[{a:g} {b:g}; {c:g} {d:g}]; convert the clip"
+        )
+    image = image if a else image.swapaxes(0, 1)
+    return image[:: int(b + d), :: int(a + c)]
+
+
+def _eight_bits(image: np.ndarray, white: int) -> np.ndarray:
+    """Return an image of 16 bits with 8 bits, any other one as it is.
+
+    Raises:
+        ValueError: a value is above white.
+    """
+    if image.dtype != np.uint16:
+        return image
+    if image.max() > white:
+        raise ValueError(
+            f"expected values up to the `white` of capture.json, {white}, got {image.max()}; "
+            "correct it"
+        )
+    return cv2.convertScaleAbs(image, alpha=255 / white)
+
+
 def _unreadable(path: Path, reason: str) -> ValueError:
     return ValueError(
         f"{path}: expected a video, got {path.stat().st_size} bytes that FFmpeg cannot read "
@@ -293,7 +416,9 @@ class FolderReader(_Frames):
     numbers: range | None = None
     #: Largest value of the first image if it has 16 bits, otherwise None.
     most: int | None = None
-    white: int = _WHITE  #: Value of white in images of 16 bits.
+    white: int = WHITE  #: Value of white in images of 16 bits.
+    start: ClassVar[None] = None
+    notes: tuple[str, ...] = ()  #: A sentence for each property of the files that is not used.
 
     @classmethod
     def open(cls, path: str | Path) -> FolderReader:
@@ -324,9 +449,14 @@ class FolderReader(_Frames):
         for file in () if gaps else files:
             existing_file(file, *_IMAGE)
         readable = (f for f in files if not (gaps and isinstance(_image_or_error(f), Exception)))
-        first = _read_image(next(readable, files[0]))
+        file = next(readable, files[0])
+        first = _read_image(file)
+        height, width = first.shape[:2]
         most = int(first.max()) if first.dtype == np.uint16 else None
-        return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0], most=most)
+        notes = []
+        if (pages := cv2.imcount(str(file))) > 1:
+            notes = [f"images have {pages} pages, of which the first is used; extract all."]
+        return cls(files[0].parent, tuple(files), width, height, most=most, notes=tuple(notes))
 
     @property
     def num_frames(self) -> int:
@@ -359,15 +489,11 @@ class FolderReader(_Frames):
                     f"{file}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
                     f"{frame.shape[1]}x{frame.shape[0]}; extract the frames again."
                 )
-            elif frame.dtype != np.uint16:
-                yield frame
-            elif frame.max() > self.white:
-                yield ValueError(
-                    f"{file}: expected values up to {self.white} as in the first images, got "
-                    f"{frame.max()}; convert the images to 8 bits."
-                )
             else:
-                yield cv2.convertScaleAbs(frame, alpha=255 / self.white)
+                try:
+                    yield _eight_bits(frame, self.white)
+                except ValueError as error:
+                    yield ValueError(f"{file}: {error}.")
 
 
 FrameReader = VideoReader | FolderReader
@@ -377,55 +503,43 @@ ImageOrError = np.ndarray | ValueError | FileNotFoundError
 """A frame, or the reason why it is missing."""
 
 
-def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
+def open_clips(
+    clips: Sequence[Clip], gaps: bool = False, white: int | None = None
+) -> list[FrameReader]:
     """Return one reader per camera; with `gaps`, images may be missing or broken.
 
     Folders that count together (see `counting_together`) are then aligned by the numbers of their
     images: a number that only others have is a missing image.
 
-    Images of 16 bits may hold the values of fewer, see `_with_white`.
+    Without `white`, a warning names images of 16 bits that are nearly black, because cameras of 10
+    or 12 bits may have written them.
+
+    Args:
+        clips: one per camera.
+        gaps: whether images may be missing.
+        white: value of white in images of 16 bits; None: the largest.
 
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
-    readers = _aligned_folders(
+    folders = _aligned_folders(
         [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
     )
-    return _with_white(
-        [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
-    )
-
-
-def _with_white(readers: list[FrameReader]) -> list[FrameReader]:
-    """Return readers with the white of images of 16 bits, which may hold the 8, 10, 12 or 14 bits
-    of cameras.
-
-    They do if the first images have no larger value, and the brightest camera nearly the largest.
-    A dark image of 16 bits has it by chance only. Cameras that disagree, or no such value, are
-    reported: a dark image cannot be distinguished.
-    """
-    folders = [r for r in readers if isinstance(r, FolderReader) and r.most is not None]
-    values = [folder.most or 0 for folder in folders]
-    most = max(values, default=_WHITE)
-    if most >= 2 ** max(_BITS):
-        return readers
-    # The upper sixteenth of the values, as highlights are.
-    bits = [b for b in _BITS if any(15 * 2**b <= 16 * value < 16 * 2**b for value in values)]
-    place = f"{folders[0].path} and the other cameras: images of 16 bits have values up to {most}"
-    if len(bits) != 1 or most >= 2 ** bits[0]:
+    readers = [folders[clip] if clip in folders else open_frames(clip, gaps) for clip in clips]
+    deep = [reader for reader in readers if reader.most is not None]
+    most = max((reader.most or 0 for reader in deep), default=WHITE)
+    if white is None and most < WHITE // 4:
         _LOG.warning(
-            "%s of %d and are nearly black; if white is less, multiply them.", place, _WHITE
+            "%s: the first images of %d cameras have 16 bits but no value above %d and are nearly "
+            'black; if white is less than %d, such as 4095 of cameras with 12 bits, set "white": '
+            "4095 in capture.json.",
+            few([reader.path.name for reader in deep]),
+            len(deep),
+            most,
+            WHITE,
         )
-        return readers
-    white = 2 ** bits[0] - 1
-    _LOG.warning(
-        "%s and are read as %d bits; if white is %d, convert them to 8 bits.",
-        place,
-        bits[0],
-        _WHITE,
-    )
-    return [replace(r, white=white) if isinstance(r, FolderReader) else r for r in readers]
+    return [replace(reader, white=white or WHITE) for reader in readers]
 
 
 def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
@@ -435,6 +549,8 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
         ValueError: there are far more timestamps than images.
     """
     files_by_number = {folder: _images(folder) for folder in folders}
+    for folder, files in files_by_number.items():
+        check_counting(folder, [*files], [file.name for file in files.values()])
     readers: dict[Clip, FrameReader] = {}
     for group in counting_together({f: sorted(files) for f, files in files_by_number.items()}):
         clips = [files_by_number[folder] for folder in group]
@@ -469,11 +585,12 @@ def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> Fram
 
 def _images(path: Path) -> dict[int, Path]:
     """Return a folder's images by their numbers, in natural order."""
-    files = sorted(images_in(path) if path.is_dir() else [], key=lambda f: natural_key(f.stem))
-    if not files:
+    images = by_stem(images_in(path) if path.is_dir() else [])
+    names = sorted(images, key=natural_key)
+    if not names:
         suffixes = ", ".join((*IMAGE_SUFFIXES, EXR_SUFFIX))
         raise FileNotFoundError(f"{path}: expected images ({suffixes}), found none; extract them.")
-    return dict(zip(frame_numbers(path, [file.stem for file in files]), files, strict=True))
+    return dict(zip(frame_numbers(path, names), (images[name] for name in names), strict=True))
 
 
 def _image_or_error(file: Path) -> ImageOrError:

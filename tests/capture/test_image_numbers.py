@@ -104,7 +104,16 @@ def test_align_numbers__are_those_that_change(tmp_path, reading):
     rows = frame_numbers(load_capture(path, reading=GAPS))
     assert rows == [[0, 0], [1, None], [2, 2]]
     (path / "a2" / "0002_a2.png").rename(path / "a2" / "0000_b2.png")
-    with pytest.raises(ValueError, match=r"a2: expected one file .* got 0000_a2 and 0000_b2"):
+    with pytest.raises(ValueError, match=r"a2: expected one number .* 0000_a2 followed by 0000_b2"):
+        load_capture(path, reading=reading)
+
+
+@pytest.mark.parametrize("reading", [ReadConfig(), TRIM, GAPS])
+def test_align_numbers__are_no_times(tmp_path, reading):
+    """Times in milliseconds of two cameras."""
+    path = capture_of(tmp_path / "c", a=[0, 33, 67, 100], b=[1, 34, 66, 101])
+    message = r"a: expected numbers that count the frames .* got 0033.png followed by 0067.png"
+    with pytest.raises(ValueError, match=message):
         load_capture(path, reading=reading)
 
 

@@ -1,5 +1,6 @@
 """Clips with different lengths, rates and starts, and missing images."""
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -7,6 +8,7 @@ from numpy.testing import assert_allclose
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.main import main
+from morgs_mi.io.frame_times import time_code_seconds
 from morgs_mi.io.video_writer import write_video
 from tests.scenes import captures as layouts
 
@@ -93,6 +95,79 @@ def test_timeline__delays_or_interpolates_clips_of_other_rates(
     capture = load_capture(capture_of(tmp_path / "c", clips, 40), reading=ReadConfig(offset=offset))
     assert [camera.delay for camera in capture.cameras] == delays
     assert frame_numbers(capture)[: len(timestamps)] == timestamps
+
+
+TIME_CODES = {
+    # The time codes of a and b, and what is advised.
+    "later": (("01:00:00:00", "01:00:00:02"), "--offset b -2."),
+    "earlier, over a minute": (("01:01:00:00", "01:00:59:23"), "--offset b 2."),
+    "equal": (("01:00:00:00", "01:00:00:00"), ""),
+    "of other recordings": (("01:00:00:00", "09:30:00:00"), ""),
+    "of one clip": (("01:00:00:00", ""), ""),
+}
+
+
+@pytest.mark.parametrize("case", TIME_CODES)
+@pytest.mark.parametrize("suffix", [".mov", ".mp4", ".mkv"])
+def test_timeline__names_time_codes_that_differ(tmp_path, caplog, case, suffix):
+    codes, advice = TIME_CODES[case]
+    layouts.n3dv(tmp_path / "c", ("a", "b"), lambda *_: None)
+    for i, (name, code) in enumerate(zip("ab", codes, strict=True)):
+        clip = tmp_path / "c" / f"{name}{suffix}"
+        times = range(0, 240, 40)
+        layouts.write_timed_video(clip, layouts.frames(i, 6), times, "libx264", time_code=code)
+    for config in (ReadConfig(), ReadConfig(trim=True)):
+        caplog.clear()
+        assert load_capture(tmp_path / "c", reading=config).num_frames == 6
+        assert bool(caplog.text) == bool(advice)
+        assert advice in caplog.text
+    name, offset = (advice or "--offset b 1.").removeprefix("--offset ").rstrip(".").split()
+    caplog.clear()
+    load_capture(tmp_path / "c", reading=ReadConfig(offset={name: float(offset)}))
+    assert "time codes" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("code", "fps", "seconds"),
+    [
+        ("00:01:00:12", 24, 60.5),
+        ("01:00:00;00", 30000 / 1001, 3600),
+        ("00:10:00;02", 30000 / 1001, 600.0667),
+        ("00:01:00;02", 30000 / 1001, 60.06),
+        ("00:01:00;04", 60000 / 1001, 60.06),
+        ("noon", 25, None),
+    ],
+)
+def test_time_code_seconds__follows_the_clock(code, fps, seconds):
+    assert time_code_seconds(code, fps) == pytest.approx(seconds, abs=0.01)
+
+
+def test_load_capture__names_the_cameras_of_a_note_together(tmp_path, caplog):
+    path = capture_of(tmp_path / "c", {"a": (3, 25), "b": (3, 25)})
+    for name in ("a", "b"):
+        (path / f"{name}.mkv").unlink()
+        cv2.imwritemulti(str(path / f"{name}.tif"), [layouts.frames(0)[0]] * 3)
+    capture = load_capture(path)
+    assert capture.notes[0] == (
+        "a, b: images have 3 pages, of which the first is used; extract all."
+    )
+    assert capture.notes[0] in caplog.text
+
+
+def test_load_capture__takes_white_from_the_settings(tmp_path, caplog):
+    path = capture_of(tmp_path / "c", {"a": (2, 25), "b": (2, 25)})
+    for name in ("a", "b"):
+        (path / f"{name}.mkv").unlink()
+        (path / name).mkdir()
+        image = np.full((layouts.HEIGHT, layouts.WIDTH, 3), 2048, np.uint16)
+        for t in range(2):
+            cv2.imwrite(str(path / name / f"{t}.png"), image)
+    load_capture(path)
+    assert "nearly black; if white is less than 65535" in caplog.text
+    (path / "capture.json").write_text('{"white": 4095}')
+    caplog.clear()
+    assert next(load_capture(path).frames()).images[0].max() == 128
+    assert not caplog.text
 
 
 def test_load_capture__reads_the_readout_of_cameras(tmp_path):

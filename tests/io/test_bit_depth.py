@@ -1,43 +1,51 @@
-"""Images of 16 bits that hold the values of cameras of fewer."""
+"""Images and videos of 16 bits that may hold the values of cameras with fewer."""
 
 import cv2
 import numpy as np
 import pytest
 
 from morgs_mi.io.video import open_clips
+from tests.scenes.captures import write_timed_video
 
 
+def write_camera(path, kind, values):
+    """Write grey images of 16 bits as files, or as a lossless video."""
+    images = [np.full((32, 48), value, np.uint16) for value in values]
+    if kind == "video":
+        write_timed_video(path, images, range(0, 40 * len(values), 40), layout="gray16le")
+        return
+    path.mkdir()
+    for i, image in enumerate(images):
+        cv2.imwrite(str(path / f"{i}.png"), image)
+
+
+@pytest.mark.parametrize("kind", ["images", "video"])
 @pytest.mark.parametrize(
-    ("most", "shown", "note"),
+    ("most", "white", "shown", "note"),
     [
-        ([4095, 900], [255, 56], "values up to 4095 and are read as 12 bits"),
-        ([0, 1000, 1023], [0, 249, 255], "read as 10 bits"),
-        ([16000, 2000], [249, 31], "read as 14 bits"),
-        ([250, 255], [250, 255], "read as 8 bits"),
-        ([3000, 900], [12, 4], "values up to 3000 of 65535 and are nearly black"),
-        ([16383, 4095], [64, 16], "up to 16383 of 65535"),
-        ([51400, 4095], [200, 16], ""),
+        ([4095, 900], None, [16, 4], "no value above 4095 and are nearly black"),
+        ([4095, 900], 4095, [255, 56], ""),
+        ([900, 100], 4095, [56, 6], ""),
+        ([51400, 4095], None, [200, 16], ""),
     ],
 )
-def test_open_clips__scales_the_bits_of_cameras_or_names_dark_images(
-    tmp_path, caplog, most, shown, note
+def test_open_clips__names_dark_images_of_16_bits_without_a_white(
+    tmp_path, caplog, kind, most, white, shown, note
 ):
-    for camera, value in enumerate(most):
-        (tmp_path / str(camera)).mkdir()
-        image = np.full((32, 48, 3), value, np.uint16)
-        cv2.imwrite(str(tmp_path / str(camera) / "0.png"), image)
-    readers = open_clips([tmp_path / str(camera) for camera in range(len(most))])
+    clips = [tmp_path / f"{camera}.mkv" for camera in range(len(most))]
+    for clip, value in zip(clips, most, strict=True):
+        write_camera(clip, kind, [value])
+    readers = open_clips(clips, white=white)
     assert [next(reader.frames())[0, 0, 0] for reader in readers] == shown
     assert note in caplog.text
     assert bool(note) == bool(caplog.text)
 
 
-def test_open_clips__refuses_later_values_above_the_bits_of_cameras(tmp_path):
-    for frame, value in enumerate((4095, 5000)):
-        image = np.full((32, 48), value, np.uint16)
-        cv2.imwrite(str(tmp_path / f"{frame}.png"), image)
-    (reader,) = open_clips([tmp_path])
-    with pytest.raises(ValueError, match=r"1\.png: expected values up to 4095 .* got 5000"):
+@pytest.mark.parametrize("kind", ["images", "video"])
+def test_open_clips__refuses_values_above_white(tmp_path, kind):
+    write_camera(tmp_path / "a.mkv", kind, [4095, 5000])
+    (reader,) = open_clips([tmp_path / "a.mkv"], white=4095)
+    with pytest.raises(ValueError, match=r"expected values up to the `white` .* 4095, got 5000"):
         list(reader.frames())
 
 

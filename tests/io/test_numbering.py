@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.io.numbering import frame_numbers
+from morgs_mi.io.numbering import check_numbering, frame_numbers
 
 
 @pytest.mark.parametrize(
@@ -27,12 +27,35 @@ def test_frame_numbers__are_those_that_change(names, numbers):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["0000_left", "0000_right"], "one file of number 0, got 0000_left and 0000_right"),
-        (["7", "8", "07"], "one file of number 7, got 7 and 07"),
-        (["0_0", "0_1", "1_0", "1_1"], "one file of number 0, got 0_0 and 1_0"),
+        (["0000_left", "0000_right"], "one number .* got 0000_left followed by 0000_right"),
+        (["7", "8", "07"], "one number .* got 0?7 followed by 0?7"),
+        (["0_0", "0_1", "1_0", "1_1"], "one number .* got 0_1 followed by 1_0"),
+        (["12_30_59_29", "12_31_00_00"], "one number .* got 12_30_59_29 followed by 12_31_00_00"),
+        (["0.8", "0.9", "1.0"], "one number .* got 0.9 followed by 1.0; rename the images"),
+        (["color_0", "color_1", "depth_0"], "one number .* got color_1 followed by depth_0"),
         (["0000", "b"], "a number in each name, got b; rename it"),
     ],
 )
-def test_frame_numbers__refuses_equal_numbers_and_none(names, message):
+def test_frame_numbers__refuses_equal_numbers_another_order_and_none(names, message):
     with pytest.raises(ValueError, match=f"^cam1: expected {message}"):
         frame_numbers(Path("cam1"), names)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ([0, 1, 3, 4], "numbered without gaps, got 1 followed by 3; .*--gaps"),
+        (
+            [0, 33, 67, 100],
+            "in equal steps, got 33 followed by 67, and steps of 33",
+        ),
+        (
+            [10**18, 10**18 + 33366, 10**18 + 66733],
+            "in equal steps, got .* if their names are times",
+        ),
+    ],
+)
+def test_check_numbering__distinguishes_gaps_from_times(numbers, message):
+    with pytest.raises(ValueError, match=message):
+        check_numbering(Path("cam1"), numbers, list(map(str, numbers)))
+    check_numbering(Path("cam1"), [4, 6, 8], ["4", "6", "8"])

@@ -3,12 +3,13 @@
 import re
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from morgs_mi.io.video import FolderReader, VideoReader, open_frames
+from morgs_mi.io.video import FAR, FolderReader, VideoReader, open_frames
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from tests.scenes.captures import write_timed_video
 from tests.scenes.full_disk import files_end_at
@@ -234,13 +235,118 @@ def test_video_reader__shows_no_damaged_frame_in_place_of_another(tmp_path):
     assert_allclose(levels, reader.positions, atol=0.5)
 
 
-def test_video_reader__turns_images_as_players_do(tmp_path):
-    image = np.zeros((32, 64, 3), np.uint8)
-    image[:8, :8] = 255  # the corner at the top left comes to the top right
-    write_timed_video(tmp_path / "a.mp4", [image], [0], rotation=-90)
+# Rows of matrices that map the pixel (x, y), and what players show.
+TURNS = {
+    "90": ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
+    "180": ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
+    "270": ((0, -1, 1, 0), lambda image: np.rot90(image, 1)),
+    "mirrored": ((-1, 0, 0, 1), lambda image: image[:, ::-1]),
+    "upside down": ((1, 0, 0, -1), lambda image: image[::-1]),
+    "transposed": ((0, 1, 1, 0), lambda image: image.swapaxes(0, 1)),
+    "mirrored and turned": ((0, -1, -1, 0), lambda image: np.rot90(image, 2).swapaxes(0, 1)),
+}
+
+
+def displayed(matrix):
+    """Return an edit of a stream that gives it a display matrix."""
+    a, b, c, d = (round(value * 2**16) for value in matrix)
+    return lambda stream: stream.set_display_matrix([a, b, 0, c, d, 0, 0, 0, 2**30])
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_video_reader__shows_images_as_players_do(tmp_path, turn):
+    matrix, show = TURNS[turn]
+    (image,) = clip(count=1)
+    write_timed_video(tmp_path / "a.mp4", [image], [0], edit=displayed(matrix))
     reader = VideoReader.open(tmp_path / "a.mp4")
-    assert (reader.width, reader.height) == (32, 64)
-    assert_array_equal(next(reader.frames()), np.rot90(image, -1))
+    assert_array_equal(next(reader.frames()), show(image))
+    assert (reader.height, reader.width) == show(image).shape[:2]
+
+
+def test_video_reader__refuses_other_angles(tmp_path):
+    root = np.sqrt(0.5)
+    edit = displayed((root, root, -root, root))
+    write_timed_video(tmp_path / "a.mp4", clip(count=1), [0], edit=edit)
+    with pytest.raises(ValueError, match=r"a.mp4: expected a display matrix that .*; convert"):
+        VideoReader.open(tmp_path / "a.mp4")
+
+
+@pytest.mark.parametrize("name", ["a.avi", "a.mp4", "a.mkv", "a.mov"])
+def test_video_reader__has_frames_that_refer_to_later_ones_in_order(tmp_path, name):
+    """AVI stores the times of decoding alone."""
+    count = FAR + 30
+    images = [np.full((32, 48, 3), 20, np.uint8) for _ in range(count)]
+    for t, image in enumerate(images):
+        image[:, :24] += np.uint8(16 * (t // 12))
+        image[:, 24:] += np.uint8(16 * (t % 12))
+    write_timed_video(tmp_path / name, images, range(0, 40 * count, 40), "libx264")
+    reader = VideoReader.open(tmp_path / name)
+    assert (reader.num_frames, reader.num_held, reader.positions) == (count, count, None)
+    for start in (0, 3, FAR + 5):
+        frames = np.array(list(reader.frames(start)), float)
+        levels = np.rint((frames.reshape(-1, 32, 2, 24, 3).mean(axis=(1, 3, 4)) - 20) / 16)
+        assert_array_equal(levels @ [12, 1], np.arange(start, count))
+
+
+def write_tracks(path, tracks):
+    """Write a video with a track of ones times each of the `tracks`, from a title to a value."""
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("ffv1", rate=25) for _ in tracks]
+        for stream, title in zip(streams, tracks, strict=True):
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
+            stream.metadata["title"] = title
+        for t in range(COUNT):
+            for stream, value in zip(streams, tracks.values(), strict=True):
+                image = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
+                frame = av.VideoFrame.from_ndarray(image, "rgb24")
+                frame.pts = t
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode())
+
+
+def test_video_reader__takes_the_first_track_and_names_the_others(tmp_path):
+    write_tracks(tmp_path / "a.mkv", {"COLOR": 90, "INFRARED": 30, "DEPTH": 10})
+    reader = VideoReader.open(tmp_path / "a.mkv")
+    assert [frame[0, 0, 0] for frame in reader.frames()] == [90] * COUNT
+    assert reader.notes == ("the first video track, COLOR, is used, and not INFRARED, DEPTH.",)
+
+
+def colored(transfer, primaries):
+    def edit(stream):
+        stream.codec_context.color_trc = transfer
+        stream.codec_context.color_primaries = primaries
+
+    return edit
+
+
+def interlaced(stream):
+    stream.codec_context.flags |= av.codec.context.Flags.interlaced_dct
+    stream.options = {"x264-params": "tff=1:interlaced=1"}
+
+
+@pytest.mark.parametrize(
+    ("edit", "note"),
+    [
+        (colored(18, 9), "colours of HLG and BT.2020 are used as those of sRGB"),
+        (colored(16, 9), "colours of PQ and BT.2020"),
+        (colored(1, 12), "colours of Display P3"),
+        (interlaced, "interlaced: each frame has the rows of two moments"),
+        (colored(1, 1), ""),
+    ],
+)
+def test_video_reader__names_properties_that_are_not_used(tmp_path, edit, note):
+    write_timed_video(tmp_path / "a.mp4", smooth_clip(), range(0, 240, 40), "libx264", edit=edit)
+    notes = VideoReader.open(tmp_path / "a.mp4").notes
+    assert [text[: len(note)] for text in notes] == ([note] if note else [])
+
+
+@pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile 'b.mkv'\n", "#EXTM3U\nb.mkv\n"])
+def test_video_reader__opens_no_files_that_a_text_names(tmp_path, text):
+    write_video(tmp_path / "b.mkv", clip(), 30)
+    (tmp_path / "a.mp4").write_text(text)
+    with pytest.raises(ValueError, match=r"a.mp4: expected a video, got \d+ bytes"):
+        VideoReader.open(tmp_path / "a.mp4")
 
 
 def test_video_reader__takes_a_colon_as_part_of_a_path(tmp_path, monkeypatch):

@@ -54,26 +54,32 @@ def videos(path, names, suffix=".mkv"):
         write_video(path / f"{name}{suffix}", frames(i), FPS)
 
 
-def write_timed_video(path, images, times, codec="ffv1", rotation=0):
+def write_timed_video(
+    path, images, times, codec="ffv1", layout="rgb24", edit=lambda stream: None, time_code=""
+):
     """Write a video that shows its frames at `times`, in ascending milliseconds from 0.
 
     Args:
         path: the file.
-        images: the frames, uint8 [H, W, 3].
+        images: the frames, uint8 [H, W, 3], or as `layout` has them.
         times: of the frames.
         codec: FFmpeg's name of it; only `ffv1` is lossless.
-        rotation: angle that players turn the images by, degrees.
+        layout: FFmpeg's name of the pixels' layout in `images`.
+        edit: changes the stream before it is written.
+        time_code: of the first frame.
     """
     with av.open(str(path), "w") as container:
+        if time_code:
+            container.metadata["timecode"] = time_code
         period = int(np.gcd.reduce(times)) or 40
         stream = container.add_stream(codec, rate=Fraction(1000, period))
         stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}.get(codec, "yuv420p")
+        stored = {"ffv1": "bgr0" if layout == "rgb24" else layout, "mjpeg": "yuvj420p"}
+        stream.pix_fmt = stored.get(codec, "yuv420p")
         stream.codec_context.time_base = Fraction(period, 1000)
-        if rotation:
-            stream.set_display_rotation(rotation)
+        edit(stream)
         for image, time in zip(images, times, strict=True):
-            frame = av.VideoFrame.from_ndarray(image, "rgb24")
+            frame = av.VideoFrame.from_ndarray(image, layout)
             frame.pts = time // period
             frame.time_base = Fraction(period, 1000)
             container.mux(stream.encode(frame))

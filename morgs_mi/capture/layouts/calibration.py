@@ -28,7 +28,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import few
 from morgs_mi.core.rig import far_origin, moved, scene_extent
 from morgs_mi.io.listing import VIDEO_SUFFIXES, images_in, listed
-from morgs_mi.io.video import Clip, natural_key
+from morgs_mi.io.numbering import natural_key
+from morgs_mi.io.video import Clip
 
 _LOG = logging.getLogger(__name__)
 
@@ -235,8 +236,8 @@ def match_clips(
             raise errors[0]
         raise FileNotFoundError(
             f"{source}: expected clips named after its cameras "
-            f"{few([camera.name for camera in cameras])}, found {', '.join(clips)}; name the clips "
-            "after the cameras."
+            f"{few([camera.name for camera in cameras])}, found {few([*clips])}; name the clips "
+            "after the cameras, one each: join the chapters of a video."
         )
     clips = match.clips
     if any(isinstance(clip, tuple) and len(clip) > 1 for clip in clips.values()):

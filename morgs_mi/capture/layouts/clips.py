@@ -3,24 +3,27 @@
 A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips
 are stored per camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
 
-- per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a
-  folder of it (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of one name the
-  lossless one in ``frames/`` takes precedence, then a video, then a folder; clips in the capture
-  itself take precedence over those in a folder, and those in the folder ``images`` or ``videos``
-  over those in others. Files that differ in their suffixes are refused;
+- per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png`` (or ``color``,
+  ``rgb``), in the capture or in a folder of it (``videos/cam01.mp4``, ``images/cam01/0000.png``).
+  Of several clips of one name the lossless one in ``frames/`` takes precedence, then a video, then
+  a folder; clips in the capture itself take precedence over those in a folder, and those in the
+  folder ``images`` or ``videos`` over those in others, which are otherwise refused;
 - per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
 - photos: ``cam01.png`` or ``images/cam01.png``, one image per camera;
 - in folders of folders: ``images/rig1/cam01/0000.png`` or photos ``images/day/1.png``, where
   cameras of one name in two folders are called ``rig1_cam01``, and ``cam01/GX010042.MP4``, the only
   video of its folder, as on memory cards.
 
-Images are files of 8 bits, or EXR files, which have linear light, where a folder has no others.
+Images are files of 8 or 16 bits, or EXR files, which have linear light, where a folder has no
+others. Folders called after depth, infrared, normals or a mask hold no clips. Files that differ in
+their suffixes are refused. Names are compared in their composed form.
 """
 
 from __future__ import annotations
 
 import logging
 import re
+from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -28,10 +31,10 @@ from typing import TypeVar
 
 import imagesize
 
-from morgs_mi.core.checks import few
-from morgs_mi.io.listing import VIDEO_SUFFIXES, images_in, listed
-from morgs_mi.io.numbering import check_numbering, frame_numbers
-from morgs_mi.io.video import Clip, natural_key, open_frames
+from morgs_mi.core.checks import composed, few
+from morgs_mi.io.listing import VIDEO_SUFFIXES, by_stem, images_in, listed
+from morgs_mi.io.numbering import check_numbering, frame_numbers, natural_key
+from morgs_mi.io.video import Clip, open_frames
 
 _LOG = logging.getLogger(__name__)
 _Clip = TypeVar("_Clip", Path, tuple[Path])
@@ -42,11 +45,14 @@ EXAMPLE = (
 )
 """The layout of a recording in images, for messages."""
 
-# Folders without clips, and folders with images that do not belong to a camera.
-_NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
+# Folders of other images than colours, folders without clips, and folders with images that do not
+# belong to a camera of their name.
+_OTHER_IMAGES = {"alpha", "depth", "depths", "infrared", "ir", "mask", "normal", "normals"}
+_NOT_CLIPS = {"sparse", "truth", "masks", "seg", *_OTHER_IMAGES}
 # Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
 _COPIES = re.compile(r"images_[0-9]+")
-_NOT_CAMERAS = re.compile(rf"{'|'.join(_NOT_CLIPS)}|frames|images|{_COPIES.pattern}")
+_COLORS = ("images", "color", "rgb")
+_NOT_CAMERAS = re.compile("|".join((*_NOT_CLIPS, "frames", *_COLORS, _COPIES.pattern)))
 _USUAL = {"images", "videos"}
 
 
@@ -54,6 +60,9 @@ def find_clips(path: Path) -> Mapping[str, Clip]:
     """Return each camera's video, folder of images or photo by the camera's name, in numerical
     order; errors of `clips_by_camera`.
     """
+    others = {f.name for place in (path, *_places(path)) for f in listed(place) if f.is_dir()}
+    if others := sorted(others & _OTHER_IMAGES):
+        _LOG.warning("%s: only images of colours are used, not those in %s.", path, few(others))
     return clips_by_camera(path) or photos(path) or clips_by_rig(path)
 
 
@@ -64,17 +73,18 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
         ValueError: two videos in one folder differ only in their suffixes.
     """
     inner = _places(path)
-    videos = [_videos(place) for place in inner]
-    cards = [
-        clips
-        for place, clips in zip(inner, videos, strict=True)
-        if len(clips) == 1 and place.name not in _USUAL
-    ]
-    # Memory cards count from the same number.
-    are_cards = len(set().union(*cards)) < len(cards)
-    # The last clip of a camera takes precedence.
-    clips = _merged(path, map(_folders, inner))
-    clips |= clips_by_rig(path) if are_cards else _merged(path, videos)
+    in_others = [_folders(place) | _videos(place) for place in inner if place.name not in _USUAL]
+    names = set().union(*in_others)
+    # Rigs and memory cards repeat the names of their clips.
+    clips = (
+        clips_by_rig(path) if len(names) < sum(map(len, in_others)) else dict(ChainMap(*in_others))
+    )
+    for place in inner[len(in_others) :]:
+        usual = _folders(place) | _videos(place)
+        if repeats := [name for name in usual if name in clips]:
+            first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, usual))
+            _LOG.warning("%s: clips such as %s are used, not %s.", path, last, first)
+        clips |= usual
     clips |= _folders(path) | _videos(path)
     if (path / "frames").is_dir():
         clips |= _videos(path / "frames") | _folders(path / "frames")
@@ -89,7 +99,8 @@ def clips_by_rig(path: Path) -> dict[str, Path]:
     def clips(folder: Path) -> dict[str, Path]:
         videos = _videos(folder)
         only = len(videos) == 1
-        return _folders(folder) | ({folder.name: videos.popitem()[1]} if only else videos)
+        name = composed(folder.name)
+        return _folders(folder) | ({name: videos.popitem()[1]} if only else videos)
 
     return _by_rig(path, clips)
 
@@ -100,13 +111,13 @@ def photos_by_rig(path: Path) -> dict[str, tuple[Path]]:
 
 
 def _photos(folder: Path) -> dict[str, tuple[Path]]:
-    return {name: (image,) for name, image in _by_stem(images_in(folder)).items()}
+    return {name: (image,) for name, image in by_stem(images_in(folder)).items()}
 
 
 def _by_rig(path: Path, clips: Callable[[Path], dict[str, _Clip]]) -> dict[str, _Clip]:
     """Return the `clips` of the folders in a capture and in its folders."""
     rigs = [rig for place in (path, *_places(path)) for rig in _places(place)]
-    clips_of_rigs = [(rig.name, *clip) for rig in rigs for clip in clips(rig).items()]
+    clips_of_rigs = [(composed(rig.name), *clip) for rig in rigs for clip in clips(rig).items()]
     unique = len({name for _, name, _ in clips_of_rigs}) == len(clips_of_rigs)
     return _in_order(
         {name if unique else f"{rig}_{name}": clip for rig, name, clip in clips_of_rigs}
@@ -141,7 +152,7 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
     frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
     if not frames:
         return {}
-    images = _in_order(_by_stem(images_in(frames[0])))
+    images = _in_order(by_stem(images_in(frames[0])))
     return {name: tuple(f / image.name for f in frames) for name, image in images.items()}
 
 
@@ -167,7 +178,8 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
         ValueError: a camera that is left out does not exist, or all are left out.
     """
     check_names(path, "without", without, names)
-    rest = [name for name in names if name not in without]
+    excluded = set(map(composed, without))
+    rest = [name for name in names if name not in excluded]
     if without and not rest:
         raise ValueError(f"{path}: `without` must leave at least one camera, got all.")
     return rest
@@ -179,7 +191,7 @@ def check_names(place: Path, setting: str, names: Iterable[str], cameras: Collec
     Raises:
         ValueError: there is no such camera.
     """
-    if unknown := [name for name in names if name not in cameras]:
+    if unknown := [name for name in names if composed(name) not in cameras]:
         raise ValueError(
             f"{place}: `{setting}` must name cameras of {few([*cameras])}, got {few(unknown)}."
         )
@@ -192,7 +204,7 @@ def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -
     ``cam01/images/0000.png``. Of ``1/2.png`` it is 1_2 if that is a view, otherwise 2, or with
     `by_folder` 1, if there are both.
     """
-    place = PurePosixPath(image.replace("\\", "/"))
+    place = PurePosixPath(composed(image).replace("\\", "/"))
     folders = place.parts[-2::-1]
     file_names = (place.stem, place.name)
     pairs = pairwise((*place.parts[:-1], place.stem))
@@ -205,6 +217,7 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     """Return the clip called `camera`, otherwise the only one with this word in its name
     (``trial_2-camA``).
     """
+    camera = composed(camera)
     if camera in clips:
         return camera
     word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
@@ -222,7 +235,9 @@ def clip_of_image(folder: Path, image: str, clips: Mapping[str, Clip]) -> Clip |
     """
     file = folder / image.replace("\\", "/")
     if not file.is_file() and file.parent.is_dir():  # a name without the suffix
-        file = {other.stem: other for other in images_in(file.parent)}.get(file.name, file)
+        name = composed(file.name)
+        others = images_in(file.parent)
+        file = next((f for f in others if name in map(composed, (f.stem, f.name))), file)
     if file.is_file():
         return file
     name = view_of_image(clips, image, by_folder=True)
@@ -246,53 +261,18 @@ def size_of_clip(clip: Clip) -> tuple[int, int]:
 
 def _folders(folder: Path) -> dict[str, Path]:
     inner = [f for f in listed(folder) if f.is_dir() and not _NOT_CAMERAS.fullmatch(f.name)]
-    return {f.name: images for f in inner if (images := _image_folder(f))}
+    return {composed(f.name): images for f in inner if (images := _image_folder(f))}
 
 
 def _videos(folder: Path) -> dict[str, Path]:
-    return _by_stem(f for f in listed(folder) if f.is_file() and f.suffix.lower() in VIDEO_SUFFIXES)
-
-
-def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
-    """Return files by their names without suffix.
-
-    Raises:
-        ValueError: two have the same.
-    """
-    files_by_stem: dict[str, Path] = {}
-    for file in files:
-        if (other := files_by_stem.setdefault(file.stem, file)) != file:
-            raise ValueError(
-                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; "
-                "move one away."
-            )
-    return files_by_stem
-
-
-def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]:
-    """Return the clips in folders of the capture `path`, the last one of each name, with a warning
-    if it has others.
-    """
-    result: dict[str, Path] = {}
-    for clips in places:
-        if repeats := [name for name in clips if name in result]:
-            first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
-            _LOG.warning(
-                "%s: %s have two clips, such as %s and %s: the latter is used.",
-                path,
-                ", ".join(repeats),
-                first,
-                last,
-            )
-        result |= clips
-    return result
+    return by_stem(f for f in listed(folder) if f.is_file() and f.suffix.lower() in VIDEO_SUFFIXES)
 
 
 def _image_folder(folder: Path) -> Path | None:
-    """Return the folder that holds a camera's or a frame's images: its own or the `images` folder
-    in it, or None.
+    """Return the folder that holds a camera's or a frame's images: its own, the `images` folder in
+    it or another one of colours, or None.
     """
-    for place in (folder, folder / "images"):
+    for place in (folder, *(folder / name for name in _COLORS)):
         if place.is_dir() and images_in(place):
             return place
     return None

@@ -42,7 +42,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import errors_at, few
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.listing import existing_file, listed
-from morgs_mi.io.video import natural_key
+from morgs_mi.io.numbering import natural_key
 
 _LOG = logging.getLogger(__name__)
 

@@ -32,8 +32,8 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
+from morgs_mi.io.numbering import natural_key
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
-from morgs_mi.io.video import natural_key
 from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
 from morgs_mi.runs.fit_files import due_keyframe
 

@@ -19,7 +19,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.bounded import read_array, read_json, warn_unread
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import bounded, errors_at, numbers, require
-from morgs_mi.io.video import natural_key
+from morgs_mi.io.numbering import natural_key
 
 _LOG = logging.getLogger(__name__)
 

@@ -3,7 +3,9 @@
 import json
 import re
 import shutil
+import unicodedata
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -345,13 +347,13 @@ def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path):
     shutil.copy(path / "cam2.mkv", path / "cam2.mov")
     with pytest.raises(
         ValueError,
-        match=r"expected one file per camera, got cam2.mkv and cam2.mov",
+        match=r"expected one file of each name, got cam2.mkv and cam2.mov",
     ):
         load_capture(path)
     for suffix in (".png", ".jpg"):
         layouts.write_image(tmp_path / "b" / f"cam2{suffix}", 0, 0)
     with pytest.raises(
-        ValueError, match=r"expected one file per camera, got cam2.jpg and cam2.png"
+        ValueError, match=r"expected one file of each name, got cam2.jpg and cam2.png"
     ):
         photos(tmp_path / "b")
 
@@ -362,11 +364,73 @@ def test_clips_by_camera__names_clips_in_several_folders(tmp_path, caplog):
     assert clips_by_camera(tmp_path) == {
         name: tmp_path / "images" / name for name in ("cam1", "cam2")
     }
-    assert (
-        "cam1, cam2 have two clips, such as rgb/cam1 and images/cam1: the latter is used"
-        in caplog.text
-    )
+    assert "clips such as images/cam1 are used, not rgb/cam1" in caplog.text
     assert "images_2" not in caplog.text
+
+
+# Folders of a recording and of what depth cameras and other tools add, with {} for the camera.
+COLORS = {
+    "kinds of each camera": ("{}/color", ("{}/depth", "{}/infrared")),
+    "cameras of each kind": ("rgb/{}", ("depth/{}", "infrared/{}", "normal/{}")),
+    "masks in the camera's folder": ("{}", ("{}/mask",)),
+}
+
+
+@pytest.mark.parametrize("kind", COLORS)
+def test_find_clips__reads_colors_and_names_what_else_there_is(tmp_path, caplog, kind):
+    colors, others = COLORS[kind]
+    names = ("cam1", "cam2", "cam3")
+    for folder in others:
+        for name in names:
+            write_video(tmp_path / folder.format(name), layouts.frames(9), FPS)
+    for i, name in enumerate(names):
+        for t in range(COUNT):
+            layouts.write_image(tmp_path / colors.format(name) / f"{t:04d}.png", i, t)
+    write_colmap(tmp_path / "sparse/0", rig(names))
+    assert_holds(load_capture(tmp_path), names, (0, 1, 2))
+    words = sorted(Path(folder.format("")).name for folder in others)
+    assert f"only images of colours are used, not those in {', '.join(words)}" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (("{}/GX010042.mkv", "{}/GX020042.mkv"), "found cam1_GX010042, .*: join the chapters"),
+        (("left/{}.mkv", "right/{}.mkv"), "found left_cam1, left_cam2, .* right_cam2"),
+        (("{}/0.png", "{}/0.jpg"), "cam1: expected one file of each name, got 0.jpg and 0.png"),
+    ],
+)
+def test_load_capture__refuses_several_clips_of_a_camera(tmp_path, caplog, files, names):
+    for file in files:
+        for camera in ("cam1", "cam2"):
+            path = tmp_path / file.format(camera)
+            if path.suffix == ".mkv":
+                write_video(path, layouts.frames(0), FPS)
+            else:
+                layouts.write_image(path, 0, 0)
+    write_colmap(tmp_path / "sparse/0", rig(("cam1", "cam2")))
+    with pytest.raises((ValueError, FileNotFoundError), match=names):
+        load_capture(tmp_path)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("inner", ["", "images"])
+def test_load_capture__compares_names_in_one_unicode_form(tmp_path, inner):
+    """Files copied from macOS have decomposed names."""
+    names = ("Mïtte", "Nörd", "Süd")
+    for i, name in enumerate(names):
+        folder = unicodedata.normalize("NFD" if i else "NFC", name)
+        write_video(tmp_path / folder / inner, layouts.frames(i), FPS)
+    write_colmap(tmp_path / "sparse/0", rig(names))
+    settings = {"test_view": unicodedata.normalize("NFD", "Nörd"), "readout": {"Su\u0308d": 0.5}}
+    (tmp_path / "capture.json").write_text(json.dumps(settings))
+    capture = load_capture(tmp_path)
+    assert_holds(capture, names, (0, 1, 2))
+    assert capture.test_views == (1,)
+    assert capture.cameras[2].readout == 0.5
+    offset = ReadConfig(offset={"Su\u0308d": 1}, without=("No\u0308rd",))
+    capture = load_capture(tmp_path, reading=offset)
+    assert [image[20, 30, 1] for image in next(capture.frames()).images] == [0, 1]
 
 
 # Clips and photos in folders of folders, the images that a calibration names, and the cameras.
