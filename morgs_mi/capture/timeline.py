@@ -5,8 +5,7 @@ A timestamp t = 0, 1, ... is a frame of the recording. It is shown by frame k of
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
 Folders of images have an o and r by the numbers of their images, too. The numbers are times: images
-with the same number are simultaneous. Cameras whose numbers do not overlap, such as 1000 to 1010
-and 2340 to 2350, count separately, and the first images of such cameras are simultaneous.
+with the same number are simultaneous.
 
 In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows
 the timestamp. If o is not whole, the clip has no frame of the timestamp. With a whole r, the
@@ -17,7 +16,7 @@ nearest frame is used unchanged: it is always later by the same time, the camera
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import lcm
 from pathlib import Path
@@ -29,8 +28,7 @@ from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.checks import check_number, composed, few
 from morgs_mi.core.config import config_class
-from morgs_mi.io.numbering import counting_together
-from morgs_mi.io.video import FolderReader, FrameReader
+from morgs_mi.io.video import FrameReader
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
@@ -179,55 +177,40 @@ def _by_numbers(
     """Return the clocks of clips by the numbers of their images, too, and a sentence for each
     assumption.
     """
-    numbers = {
-        c: r.numbers
-        for c, r in enumerate(readers)
-        if isinstance(r, FolderReader) and r.numbers is not None
-    }
-    groups = counting_together(numbers)
-    notes = []
-    if len(groups) > 1 and any(len(clip_numbers) > 1 for clip_numbers in numbers.values()):
-        table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
-        notes.append(
-            f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin "
-            "at the same time."
-        )
-    different = [
-        group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1
-    ]
-    if not different:
-        return clocks, notes
-    table = "; ".join(_table(names, numbers, group) for group in different)
+    numbers = {c: clip.numbers for c, clip in enumerate(readers) if clip.numbers is not None}
+    moving = any(len(clip) > 1 for clip in numbers.values())
+    if not moving or len({(clip[0], clip.step) for clip in numbers.values()}) == 1:
+        return clocks, []
+    table = ", ".join(f"{names[c]} {_range(clip)}" for c, clip in numbers.items())
     if config.offset and not config.trim:
-        notes.append(
-            f"Images are aligned by their positions and --offset, not by their numbers: {table}."
-        )
-        return clocks, notes
-    group = {c: numbers[c] for c in different[0]}
-    common = sorted(set.intersection(*map(set, group.values()))) if len(different) == 1 else []
+        note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
+        return clocks, [note]
+    common = sorted(set.intersection(*map(set, numbers.values())))
     if not config.trim or not common:
-        remedy = f"the {len(common)} common ones with --trim, " if common else ""
+        remedy = (
+            f"the {len(common)} common ones with --trim, all numbers with --gaps, which leaves out "
+            "the cameras that lack an image, or "
+        )
         raise ValueError(
             f"{path}: images with the same number must be simultaneous and all cameras must have "
-            f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
-            "out the cameras that lack an image, or the positions of the images in place of "
-            f"their numbers with --offset {names[different[0][0]]} 0."
+            f"the same numbers, got {table}; use {remedy if common else ''}the positions of the "
+            f"images in place of their numbers with --offset {names[next(iter(numbers))]} 0."
         )
-    notes.append(
+    note = (
         f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
         "all cameras have."
     )
-    steps = [clip.step for clip in group.values()]
+    steps = [clip.step for clip in numbers.values()]
     # Other clips start with the first of these numbers.
-    first = min(clip[0] for clip in group.values())
-    clips = [group.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
+    first = min(clip[0] for clip in numbers.values())
+    clips = [numbers.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
     offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
     return _Clocks(
         clocks.offsets + offsets * clocks.rates,
         clocks.rates * np.array([lcm(*steps) / clip.step for clip in clips]),
         # The time between two timestamps, in frames of the clip with the most frames per time.
         clocks.fps / (lcm(*steps) / min(steps)),
-    ), notes
+    ), [note]
 
 
 def _notes_of_clips(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
@@ -254,11 +237,6 @@ def _time_codes(names: Sequence[str], readers: Sequence[FrameReader]) -> list[st
         f"The time codes of the clips begin up to {np.ptp(starts):.3g} s apart; if they were "
         f"synchronised, align the clips with --offset {' '.join(moved)}."
     ]
-
-
-def _table(names: Sequence[str], numbers: Mapping[int, range], group: Sequence[int]) -> str:
-    """Return the numbers of the cameras in a group."""
-    return ", ".join(f"{names[c]} {_range(numbers[c])}" for c in group)
 
 
 def _range(numbers: Sequence[int]) -> str:

@@ -1,36 +1,16 @@
-"""Numbers of the images in folders: which number of a name is the frame's, and which cameras count
-together.
+"""Numbers of the images in folders: which number of a name is the frame's, and whether the numbers
+count.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-
-Key = TypeVar("Key")
-
-
-def counting_together(numbers: Mapping[Key, Sequence[int]]) -> list[list[Key]]:
-    """Return groups of cameras whose numbers overlap; numbers of different groups do not overlap.
-
-    Args:
-        numbers: numbers of the images of each camera, ascending and not empty.
-    """
-    groups: list[list[Key]] = []
-    last = 0
-    for key in sorted(numbers, key=lambda key: numbers[key][0]):
-        if not groups or numbers[key][0] > last:
-            groups.append([])
-            last = numbers[key][-1]
-        groups[-1].append(key)
-        last = max(last, numbers[key][-1])
-    return groups
 
 
 def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:

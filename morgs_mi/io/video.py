@@ -32,7 +32,6 @@ from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_fi
 from morgs_mi.io.numbering import (
     check_counting,
     check_numbering,
-    counting_together,
     frame_numbers,
     natural_key,
 )
@@ -116,6 +115,7 @@ class VideoReader(_Frames):
     white: int = WHITE  #: As of `FolderReader`.
     notes: tuple[str, ...] = ()  #: A sentence for each property of the file that is not used.
     has_light: ClassVar[bool] = False
+    numbers: ClassVar[None] = None
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
@@ -508,8 +508,8 @@ def open_clips(
 ) -> list[FrameReader]:
     """Return one reader per camera; with `gaps`, images may be missing or broken.
 
-    Folders that count together (see `counting_together`) are then aligned by the numbers of their
-    images: a number that only others have is a missing image.
+    Folders are then aligned by the numbers of their images: a number that only others have is a
+    missing image.
 
     Without `white`, a warning names images of 16 bits that are nearly black, because cameras of 10
     or 12 bits may have written them.
@@ -546,29 +546,39 @@ def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
     """Return the readers of folders of images, aligned by the numbers of their images.
 
     Raises:
-        ValueError: there are far more timestamps than images.
+        ValueError: the numbers of a folder do not count, those of two do not overlap, or there are
+            far more timestamps than images.
     """
+    if not folders:
+        return {}
     files_by_number = {folder: _images(folder) for folder in folders}
     for folder, files in files_by_number.items():
         check_counting(folder, [*files], [file.name for file in files.values()])
+    first = max(map(min, files_by_number.values()))
+    last = min(map(max, files_by_number.values()))
+    if first > last:
+        raise ValueError(
+            f"{folders[0].parent}: expected cameras with numbers of images that overlap, got one "
+            f"that ends with {last} and one that begins with {first}; pair their images by "
+            "position with --offset in place of --gaps, or leave one out with --exclude."
+        )
+    numbers = sorted(set().union(*files_by_number.values()))
+    steps = np.diff(numbers)
+    step = math.gcd(*steps.tolist()) or 1
+    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
+        gap = int(np.argmax(steps))
+        clips = files_by_number.values()
+        file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
+        raise ValueError(
+            f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
+            "remove or renumber it."
+        )
+    timestamps = range(numbers[0], numbers[-1] + 1, step)
     readers: dict[Clip, FrameReader] = {}
-    for group in counting_together({f: sorted(files) for f, files in files_by_number.items()}):
-        clips = [files_by_number[folder] for folder in group]
-        numbers = sorted(set().union(*clips))
-        steps = np.diff(numbers)
-        step = math.gcd(*steps.tolist()) or 1
-        if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-            gap = int(np.argmax(steps))
-            file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
-            raise ValueError(
-                f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
-                "remove or renumber it."
-            )
-        timestamps = range(numbers[0], numbers[-1] + 1, step)
-        for folder, files in zip(group, clips, strict=True):
-            suffix = next(iter(files.values())).suffix
-            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
-            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
+    for folder, files in files_by_number.items():
+        suffix = next(iter(files.values())).suffix
+        images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
+        readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
     return readers
 
 

@@ -65,18 +65,19 @@ def test_align_numbers__without_a_common_one_are_refused(tmp_path):
     path = capture_of(tmp_path / "c", a=range(0, 6, 2), b=range(1, 7, 2))
     for reading in (ReadConfig(), TRIM):
         with pytest.raises(
-            ValueError, match=r"got a 0 to 4 by 2, b 1 to 5 by 2; use all numbers with --gaps"
+            ValueError, match=r"got a 0 to 4 by 2, b 1 to 5 by 2; use the positions .*--offset a 0"
         ):
             load_capture(path, reading=reading)
 
 
 @pytest.mark.parametrize("reading", [ReadConfig(), TRIM, GAPS])
-def test_align_numbers__that_do_not_overlap_count_separately(tmp_path, caplog, reading):
+def test_align_numbers__that_do_not_overlap_are_paired_by_an_offset(tmp_path, reading):
     path = capture_of(tmp_path / "c", a=range(100, 105), b=range(40, 45), c=range(40, 45))
-    capture = load_capture(path, reading=reading)
+    with pytest.raises(ValueError, match=r"(numbers|position) with --offset") as error:
+        load_capture(path, reading=reading)
+    assert ("use all numbers" in str(error.value)) is False
+    capture = load_capture(path, reading=ReadConfig(offset={"a": 0}))
     assert frame_numbers(capture) == [[100 + t, 40 + t, 40 + t] for t in range(5)]
-    assert "The numbers of the images do not overlap: b 40 to 44; a 100 to 104" in caplog.text
-    assert capture.notes[0] in caplog.text
 
 
 def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path):
