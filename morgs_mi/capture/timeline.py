@@ -224,18 +224,16 @@ def _notes_of_clips(names: Sequence[str], readers: Sequence[FrameReader]) -> lis
 
 def _time_codes(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
     """Return a sentence if overlapping clips began at different times by their time codes."""
-    if any(reader.start is None for reader in readers):
-        return []
-    fps = np.array([reader.fps for reader in readers], float)
-    starts = np.array([reader.start for reader in readers], float)
-    lengths = np.array([reader.num_frames for reader in readers]) / fps
+    fps, starts, counts = np.array([(r.fps, r.start, r.num_frames) for r in readers], float).T
+    apart = np.ptp(starts)
     offsets = np.rint((starts[0] - starts) * fps)
-    if np.ptp(starts) >= lengths.min() or not offsets.any():
+    # Comparisons are false if a time code or a rate is unknown.
+    if not (offsets.any() and apart < (counts / fps).min()):
         return []
-    moved = [f"{name} {offset:g}" for name, offset in zip(names, offsets, strict=True) if offset]
+    options = " ".join(f"{names[c]} {offsets[c]:g}" for c in np.flatnonzero(offsets).tolist())
     return [
-        f"The time codes of the clips begin up to {np.ptp(starts):.3g} s apart; if they were "
-        f"synchronised, align the clips with --offset {' '.join(moved)}."
+        f"The time codes of the clips begin up to {apart:.3g} s apart; if they were synchronised, "
+        f"align the clips with --offset {options}."
     ]
 
 

@@ -42,8 +42,8 @@ def true_rate(fps: float, frames: float, duration: float) -> float:
     return fps if not duration or difference <= _JITTER + _ROUNDING * fps else frames / duration
 
 
-def time_code_seconds(text: str, fps: float) -> float | None:
-    """Return the time of an SMPTE time code ``hh:mm:ss:ff``, s, or None for another text.
+def time_code_seconds(text: str, fps: float) -> float:
+    """Return the time of an SMPTE time code ``hh:mm:ss:ff``, s, or NaN for another text.
 
     With a semicolon before the frame, two of 30 frame numbers (four of 60) are dropped in every
     minute except each tenth one, so that the time code follows the clock at 29.97 fps.
@@ -54,7 +54,7 @@ def time_code_seconds(text: str, fps: float) -> float | None:
     """
     match = re.fullmatch(r"(\d+):(\d+):(\d+)([:;.])(\d+)", text)
     if match is None or not fps:
-        return None
+        return np.nan
     hours, minutes, seconds, frame = map(int, match.group(1, 2, 3, 5))
     minutes += 60 * hours
     count = (60 * minutes + seconds) * round(fps) + frame

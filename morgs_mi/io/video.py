@@ -25,7 +25,7 @@ import imagesize
 import numpy as np
 
 from morgs_mi.core.bounded import check_claim
-from morgs_mi.core.checks import errors_at, few
+from morgs_mi.core.checks import errors_at
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import clock, time_code_seconds, true_rate
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
@@ -110,7 +110,7 @@ class VideoReader(_Frames):
     stamps: np.ndarray | None = field(default=None, compare=False, repr=False)
     #: Times of the frames after the first, s [num_held]; None if the file does not store them.
     times: np.ndarray | None = field(default=None, compare=False, repr=False)
-    start: float | None = None  #: Time code of the first frame, s; None if there is none.
+    start: float = np.nan  #: Time code of the first frame, s; NaN if there is none.
     most: int | None = None  #: As of `FolderReader`.
     white: int = WHITE  #: As of `FolderReader`.
     notes: tuple[str, ...] = ()  #: A sentence for each property of the file that is not used.
@@ -160,7 +160,7 @@ class VideoReader(_Frames):
                 and shown == sorted(shown, key=lambda time: time or 0)
             )
             start = time_code_seconds(_time_code(container), fps)
-            is_deep = max(part.bits for part in first.format.components) == 16
+            is_deep = first.format.components[0].bits == 16
             most = int(first.to_ndarray(format="rgb48le").max()) if is_deep else None
             notes = tuple(_unused_properties(container, stream, first))
         positions = times = None
@@ -417,7 +417,7 @@ class FolderReader(_Frames):
     #: Largest value of the first image if it has 16 bits, otherwise None.
     most: int | None = None
     white: int = WHITE  #: Value of white in images of 16 bits.
-    start: ClassVar[None] = None
+    start: ClassVar[float] = np.nan
     notes: tuple[str, ...] = ()  #: A sentence for each property of the files that is not used.
 
     @classmethod
@@ -527,16 +527,16 @@ def open_clips(
         [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
     )
     readers = [folders[clip] if clip in folders else open_frames(clip, gaps) for clip in clips]
-    deep = [reader for reader in readers if reader.most is not None]
-    most = max((reader.most or 0 for reader in deep), default=WHITE)
-    if white is None and most < WHITE // 4:
+    largest = max(
+        (reader.most or 0 for reader in readers if reader.most is not None), default=WHITE
+    )
+    if white is None and largest < WHITE // 4:
         _LOG.warning(
-            "%s: the first images of %d cameras have 16 bits but no value above %d and are nearly "
-            'black; if white is less than %d, such as 4095 of cameras with 12 bits, set "white": '
-            "4095 in capture.json.",
-            few([reader.path.name for reader in deep]),
-            len(deep),
-            most,
+            "%s and the other cameras: the first images have 16 bits but no value above %d and are "
+            "nearly black; if white is less than %d, such as 4095 of cameras with 12 bits, set "
+            '"white": 4095 in capture.json.',
+            readers[0].path,
+            largest,
             WHITE,
         )
     return [replace(reader, white=white or WHITE) for reader in readers]
