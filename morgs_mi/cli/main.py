@@ -207,7 +207,9 @@ def _option_names(command: Any) -> dict[str, str]:
 
 
 def _set_up(options: Common) -> None:
-    """Send warnings to standard error and set Mitsuba's variant."""
+    """Send warnings to standard error, set Mitsuba's variant, and let it load its own plugins
+    rather than files of their names in the current folder.
+    """
     import mitsuba as mi
 
     logging.basicConfig(
@@ -219,3 +221,4 @@ def _set_up(options: Common) -> None:
         raise ValueError(
             f"--variant {options.variant} cannot be used here ({error}); try llvm_ad_rgb."
         ) from error
+    mi.file_resolver().prepend(os.path.dirname(mi.__file__))

@@ -128,12 +128,14 @@ def begin_command() -> None:
 
     Until `interruptible`, and after it, an interruption ends the process at once: a half-imported
     library raises anything. A standard stream that is closed becomes the null device; otherwise the
-    next file that is opened would take its place, and receive what libraries print.
+    next file that is opened would take its place, and receive what libraries print. The processes
+    that it starts import no module of the current folder, which may have been downloaded.
     """
     program = next(iter(sys.argv), "")
     is_module = program == "-m" and "morgs_mi" in sys.orig_argv
     if Path(program).stem != "morgs-mi" and not is_module:
         return
+    os.environ["PYTHONSAFEPATH"] = "1"
     for stream in ("stdin", "stdout", "stderr"):
         if getattr(sys, stream) is None:
             setattr(sys, stream, open(os.devnull, "r" if stream == "stdin" else "w"))  # noqa: SIM115

@@ -81,7 +81,9 @@ def works(path: Path) -> bool:
         if key in cache.read_text().splitlines():
             return True
     environment = os.environ | {VARIABLE: str(path)}
-    trial = subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True)
+    # -P: not a drjit.py of the current folder.
+    command = [sys.executable, "-P", "-c", _TRIAL]
+    trial = subprocess.run(command, env=environment, capture_output=True)
     if trial.returncode != 0:
         return False
     with suppress(OSError):

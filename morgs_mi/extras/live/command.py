@@ -139,6 +139,7 @@ def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
     """
     command = [
         sys.executable,
+        "-P",  # no module of the current folder
         "-m",
         "morgs_mi",
         "view",

@@ -8,6 +8,7 @@ with the same result.
 from __future__ import annotations
 
 import logging
+import os
 import platform
 import socket
 import threading
@@ -87,6 +88,10 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         stack.enter_context(dask.config.set(_SETTINGS))
         address: Any = scheduler
         if scheduler is None:
+            # These processes run `python -c`, which would import modules of the current folder.
+            safe_path = os.environ.get("PYTHONSAFEPATH", "")
+            stack.callback(os.environ.update, PYTHONSAFEPATH=safe_path)
+            os.environ["PYTHONSAFEPATH"] = "1"
             resource_tracker.ensure_running()  # it would let the workers have Ctrl-C again
             count = count or usable_cores()
             with postponed():

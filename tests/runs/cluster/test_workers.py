@@ -46,6 +46,19 @@ def test_open_client__starts_workers_that_share_the_cores():
 
 
 @pytest.mark.slow
+def test_open_client__starts_workers_that_import_nothing_of_the_current_folder(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "multiprocessing.py").write_text("open('executed', 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    with open_client(count=1) as client:
+        assert set(client.run(lambda: __import__("sys").flags.safe_path).values()) == {True}
+    assert not os.environ["PYTHONSAFEPATH"], "processes of the caller are as before"
+    assert not Path("executed").exists()
+
+
+@pytest.mark.slow
 def test_open_client__names_workers_that_die():
     import dask.config
 
