@@ -221,4 +221,5 @@ def _set_up(options: Common) -> None:
         raise ValueError(
             f"--variant {options.variant} cannot be used here ({error}); try llvm_ad_rgb."
         ) from error
-    mi.file_resolver().prepend(os.path.dirname(mi.__file__))
+    file_resolver: Any = mi.file_resolver
+    file_resolver().prepend(os.path.dirname(mi.__file__))

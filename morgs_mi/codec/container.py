@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import io
 import json
 import math
 import struct
@@ -41,14 +40,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO
 
-import cv2
-import imagesize
 import numpy as np
 
+from morgs_mi.core.bounded import most_memory
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, numbers
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.png import png_bytes
+from morgs_mi.core.png import PngImage, png_bytes
 from morgs_mi.core.types import Arrays
 
 _MAX_BYTES = 2**26  # most of them in strings
@@ -80,9 +78,8 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     views = []
     for camera in cameras:
         view = {key: getattr(camera, key) for key in _CAMERA}
-        if camera.background is not None:
-            image = png_bytes(byte_values(camera.background))
-            view["background"] = base64.b64encode(image).decode()
+        if (image := camera.backdrop) is not None:
+            view["background"] = base64.b64encode(png_bytes(byte_values(image))).decode()
         views.append(view)
     fields = {
         "cameras": views,
@@ -106,7 +103,15 @@ def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], floa
         ValueError: an entry is missing, or has another type or range than it must have.
     """
     cameras, fps, metadata = _entries(load_json(payload, _MAX_BYTES), _HEADER)
-    views = (camera_of_fields(fields, f"cameras[{k}]") for k, fields in enumerate(cameras))
+    views = [camera_of_fields(fields, f"cameras[{k}]") for k, fields in enumerate(cameras)]
+    # The images are decoded when they are drawn, and then stay in memory.
+    sizes = [3 * view.width * view.height for view in views if view.background is not None]
+    if sum(sizes) > most_memory(len(payload)):
+        raise ValueError(
+            f"`background` of {len(sizes)} cameras claims images of {sum(sizes) / 1e6:.0f} MB, "
+            f"more than {most_memory(len(payload)) / 1e6:.0f} MB for a header of {len(payload)} "
+            "bytes; use a colour, or smaller images"
+        )
     return tuple(views), fps, metadata
 
 
@@ -173,15 +178,12 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     return Camera(K, viewmat, width, height, name=name, near=near, background=background)
 
 
-def _image_of(text: Any, where: str, size: tuple[int, int]) -> np.ndarray:
+def _image_of(text: Any, where: str, size: tuple[int, int]) -> PngImage:
     """Return the image [H, W, 3] of a PNG file in base64; `size` is (W, H)."""
     image = None
     with contextlib.suppress(TypeError, ValueError):
-        data = base64.b64decode(text)
-        # Its own size first: a small file can claim any number of pixels.
-        if imagesize.get(io.BytesIO(data)) == size:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
-    if image is None:
+        image = PngImage(base64.b64decode(text))
+    if image is None or image.size != size:
         raise ValueError(
             f"`{where}` must be a PNG image of {size[0]}x{size[1]} pixels in base64, got "
             f"{text!r:.60}"

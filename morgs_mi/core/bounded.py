@@ -34,6 +34,11 @@ MAX_JSON = 64_000_000
 """Most bytes of a JSON file."""
 
 
+def most_memory(size: int) -> int:
+    """Return the bytes of memory that a file of `size` bytes may make its reader use."""
+    return _FACTOR * size + _ALLOWANCE
+
+
 def check_claim(path: str | Path, claimed: int, content: str) -> None:
     """Check that decoding a file takes no more memory than its size allows.
 
@@ -48,7 +53,7 @@ def check_claim(path: str | Path, claimed: int, content: str) -> None:
     """
     size = Path(path).stat().st_size
     require(
-        claimed <= _FACTOR * size + _ALLOWANCE,
+        claimed <= most_memory(size),
         path,
         f"expected content that fits its {size} bytes",
         f"a claim of {content}, which takes {claimed / 1e6:.0f} MB",

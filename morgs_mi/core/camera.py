@@ -15,8 +15,17 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.checks import LARGEST, bounded, check_number, check_size, numbers, require
+from morgs_mi.core.checks import (
+    LARGEST,
+    bounded,
+    check_number,
+    check_size,
+    errors_at,
+    numbers,
+    require,
+)
 from morgs_mi.core.color_space import unit_values
+from morgs_mi.core.png import PngImage
 from morgs_mi.core.types import Tensor
 
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
@@ -42,8 +51,8 @@ class Camera:
             middle row. Gaussians with motion are rendered where they are then.
         readout: frames between the exposures of the first and the last row; 0 for a global shutter.
         background: image [H, W, 3] behind all Gaussians in this view, in the colours of its images:
-            uint8, or floats with 1 for white. It is copied. None: the colour of the renderer's
-            settings.
+            uint8, or floats with 1 for white, which is copied; or a `PngImage` of that size, as in
+            the cameras of a stream. None: the colour of the renderer's settings.
 
     Example:
         >>> size = {"width": 320, "height": 240}
@@ -65,7 +74,7 @@ class Camera:
     near: float = 0.01
     delay: float = 0.0
     readout: float = 0.0
-    background: np.ndarray | None = None
+    background: np.ndarray | PngImage | None = None
 
     def __post_init__(self) -> None:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
@@ -94,7 +103,7 @@ class Camera:
             require(shape == (4, 4), where, "`viewmat` must be [4, 4]", shape, "pass one camera's")
         else:
             viewmat = rigid(f"{where}, `viewmat`", numbers(where, "viewmat", viewmat, 4, 4))
-        if self.background is not None:
+        if self.background is not None and not isinstance(self.background, PngImage):
             image = numbers(where, "background", self.background, self.height, self.width, 3)
             require(
                 image.dtype == np.uint8 or bounded(image),
@@ -198,6 +207,19 @@ class Camera:
         return np.rad2deg(2 * np.arctan(0.5 * self.width / self.K[0, 0]))
 
     @property
+    def backdrop(self) -> np.ndarray | None:
+        """The image behind all Gaussians, float32 [H, W, 3] with 1 for white.
+
+        Raises:
+            ValueError: it is a PNG file, which is broken.
+        """
+        image = self.background
+        if not isinstance(image, PngImage):
+            return image
+        with errors_at(f"Camera({self.name!r}), `background`"):
+            return unit_values(image.pixels, np.float32)
+
+    @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image in pixels."""
         return self.width, self.height
@@ -272,7 +294,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""
         K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
-        image = self.background
+        image = self.backdrop
         if image is not None:
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         return replace(self, K=K, width=width, height=height, background=image)

@@ -2,8 +2,42 @@
 
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+
 import cv2
 import numpy as np
+
+# The signature, and length and name of the first chunk, which begins with width and height.
+_START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+_SIZE = struct.Struct(">II")
+
+
+@dataclass(frozen=True, eq=False)
+class PngImage:
+    """RGB image in a PNG file, which is decoded when its pixels are first needed."""
+
+    data: bytes  #: The file.
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height that the file claims; zeros for a file that is no PNG."""
+        has_size = self.data.startswith(_START) and len(self.data) >= len(_START) + _SIZE.size
+        return _SIZE.unpack_from(self.data, len(_START)) if has_size else (0, 0)
+
+    @cached_property
+    def pixels(self) -> np.ndarray:
+        """The image, uint8 [H, W, 3].
+
+        Raises:
+            ValueError: the file is broken.
+        """
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), flags)
+        if image is None:
+            raise ValueError("expected a PNG image, got a broken file; write it again.")
+        return image
 
 
 def png_bytes(image: np.ndarray) -> bytes:

@@ -267,11 +267,12 @@ def backdrops(cameras: Sequence[Camera], config: RenderConfig) -> list[np.ndarra
     """Return the image behind all Gaussians for each camera [H, W, 3]; None if no camera has one:
     it is the colour of `config`.
     """
-    if all(camera.background is None for camera in cameras):
+    images = [camera.backdrop for camera in cameras]
+    if all(image is None for image in images):
         return None
     plain = np.zeros((cameras[0].height, cameras[0].width, 3), np.float32)
     plain += config.background or (0, 0, 0)
-    return [plain if camera.background is None else camera.background for camera in cameras]
+    return [plain if image is None else image for image in images]
 
 
 def over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:

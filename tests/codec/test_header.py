@@ -3,6 +3,8 @@
 import base64
 import json
 import re
+import struct
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -12,17 +14,25 @@ from numpy.testing import assert_array_equal
 from morgs_mi.codec.container import StreamWriter, header_fields, header_json, load_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.png import png_bytes
-from tests.scenes.coded_clip import CAMERAS
+from morgs_mi.core.png import jpeg_bytes, png_bytes
+from morgs_mi.render.rasterize import rasterize
+from tests.scenes.coded_clip import CAMERAS, cloud
 
 SOUND = json.loads(header_json(CAMERAS, 25, {"seed": 1}))
 
 
 SMALL = np.zeros((1, 2, 3), np.uint8)
+FITTING = np.zeros((CAMERAS[0].height, CAMERAS[0].width, 3), np.uint8)
 
 
-def encoded(image):
-    return base64.b64encode(png_bytes(image)).decode()
+def encoded(image, write=png_bytes):
+    return base64.b64encode(write(image)).decode()
+
+
+def claiming(width, height):
+    """Return the beginning of a PNG file in base64, which claims a size."""
+    file = png_bytes(SMALL)[:33]
+    return base64.b64encode(file[:16] + struct.pack(">II", width, height) + file[24:]).decode()
 
 
 def with_entry(path, text):
@@ -84,6 +94,7 @@ def test_header_fields__refuse_other_types_and_ranges(path, text, message):
         ("background", "7", ".background` must be a PNG image of"),
         ("background", '"aGFs"', ".background` must be a PNG image of"),
         ("background", f'"{encoded(SMALL)}"', ".background` must be a PNG image of"),
+        ("background", f'"{encoded(FITTING, jpeg_bytes)}"', ".background` must be a PNG image of"),
     ],
 )
 def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path, text, message):
@@ -110,8 +121,39 @@ def test_header__has_the_images_behind_the_gaussians():
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     cameras = [replace(camera, background=image), camera]
     views, _, _ = header_fields(header_json(cameras, 25, {}).encode())
-    assert_array_equal(byte_values(views[0].background), image)
-    assert views[1].background is None
+    assert_array_equal(byte_values(views[0].backdrop), image)
+    assert views[1].backdrop is None
+    text = header_json(views, 25, {})
+    assert text == header_json(cameras, 25, {})
+    again, _, _ = header_fields(text.encode())
+    assert_array_equal(again[0].resized(80, 60).backdrop, cameras[0].resized(80, 60).backdrop)
+
+
+def test_header__images_are_decoded_where_they_are_drawn():
+    camera = CAMERAS[0]
+    broken = claiming(camera.width, camera.height)
+    (view, _), _, _ = header_fields(with_entry("cameras.0.background", f'"{broken}"'))
+    with pytest.raises(ValueError, match=r"`background`: expected a PNG image, got a broken file"):
+        rasterize(cloud(), view)
+
+
+def test_header__images_are_not_rotated():
+    """OpenCV follows the orientation in a PNG file."""
+    file = png_bytes(FITTING)
+    exif = b"eXIfMM\0*\0\0\0\x08\0\1\1\x12\0\3\0\0\0\1\0\6\0\0\0\0\0\0"
+    chunk = struct.pack(">I", len(exif) - 4) + exif + struct.pack(">I", zlib.crc32(exif))
+    text = base64.b64encode(file[:33] + chunk + file[33:]).decode()
+    (view, _), _, _ = header_fields(with_entry("cameras.0.background", f'"{text}"'))
+    assert view.backdrop.shape == FITTING.shape
+
+
+def test_header_fields__refuse_images_that_take_too_much_together():
+    header = json.loads(json.dumps(SOUND))
+    image = {"width": 8192, "height": 8192, "background": claiming(8192, 8192)}
+    for count, size in ((1, 201), (2, 403)):
+        header["cameras"] = count * [SOUND["cameras"][0] | image]
+        with pytest.raises(ValueError, match=f"of {count} cameras claims images of {size} MB, mor"):
+            header_fields(json.dumps(header).encode())
 
 
 def test_load_json__accepts_what_is_within_its_limits():
