@@ -13,6 +13,7 @@ import json
 import logging
 import math
 import os
+import re
 import stat
 import tomllib
 import zipfile
@@ -32,6 +33,13 @@ MAX_TOML = 256_000
 """Most bytes of a TOML file."""
 MAX_JSON = 64_000_000
 """Most bytes of a JSON file."""
+# Bytes of memory of an object, of a list, and of an item of either.
+_JSON_BYTES = {"{": 200, "[": 60, ",": 40}
+# tomllib takes time and memory by the square of the dots in a key. A key begins behind what is no
+# part of a word or string, so that no character is searched often.
+_LONG_KEY = re.compile(
+    r"""(?<![\w\\-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){21}"""
+)
 
 
 def most_memory(size: int) -> int:
@@ -132,9 +140,13 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: the file is broken, too large or nested too deeply.
+        ValueError: the file is broken, too large or nested too deeply, or a key has many dots.
     """
     text = read_text(path, MAX_TOML)
+    has_long_key = _LONG_KEY.search(text) is not None
+    require(
+        not has_long_key, path, "expected keys of at most 20 dots", "more", "nest fewer tables"
+    )
     with _refusing(path, "TOML", "write it again"):
         return tomllib.loads(text)
 
@@ -144,9 +156,12 @@ def read_json(path: str | Path) -> Any:
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: it is no regular file, is broken, too large or nested too deeply.
+        ValueError: it is no regular file, is broken, too large or nested too deeply, or has too
+            many objects and lists for its size.
     """
     text = read_text(path, MAX_JSON)
+    claimed = sum(size * text.count(mark) for mark, size in _JSON_BYTES.items())
+    check_claim(path, claimed, "many small objects and lists")
     with _refusing(path, "JSON", "write it again"):
         return json.loads(text)
 

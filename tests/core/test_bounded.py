@@ -2,6 +2,7 @@
 
 import os
 import struct
+import time
 import tracemalloc
 import zipfile
 import zlib
@@ -111,6 +112,12 @@ CASES = {
         b"[" + b"[]," * (MAX_JSON // 3) + b"0]",
         "expected at most 64000000 bytes, got 64000002",
     ),
+    "JSON of many objects": (
+        read_json,
+        b"[" + b'{"a":1},' * 2_000_000 + b"0]",
+        "expected content that fits its 16000003 bytes, got a claim of many small objects and list",
+    ),
+    "TOML of a long key": (read_toml, b"a" + b".a" * 20_000 + b"=1", "keys of at most 20 dots"),
     "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
     "TOML of open strings": (
         read_toml,
@@ -182,6 +189,30 @@ def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path, read, content,
     with pytest.raises((ValueError, OSError), match=message) as caught:
         read(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{} = 1", "a = 1\n[{}]", "[[ {} ]]", "a = [{{{} = 1}}]"])
+def test_read_toml__refuses_keys_of_more_than_twenty_dots(tmp_path, text):
+    path = tmp_path / "a.toml"
+    for part in ("x", "-9", '""', "''", '"a.b c"', r'"\""', "'\"'", "x ", "\t'x' "):
+        path.write_text(text.format(".".join(21 * [part])))
+        assert read_toml(path)
+        path.write_text(text.format(".".join(22 * [part])))
+        with pytest.raises(ValueError, match=r"a\.toml: expected keys of at most 20 dots, got mo"):
+            read_toml(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a" * 250_000, '"' * 250_000, '"' + '\\"' * 120_000, "a" + " " * 250_000, "a. " * 80_000],
+    ids=lambda text: text[:9],
+)
+def test_read_toml__takes_no_long_time(tmp_path, text):
+    (tmp_path / "a.toml").write_text(text)
+    begin = time.process_time()
+    with pytest.raises(ValueError, match="a.toml: expected"):
+        read_toml(tmp_path / "a.toml")
+    assert time.process_time() - begin < 2
 
 
 @pytest.mark.parametrize("read", [read_array, read_json])
