@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -46,10 +47,10 @@ class Eval:
 
         folder = self.source if self.source.is_dir() else self.source.parent
         files_of_fit = [
-            path.resolve() for path in (self.source, *(folder / name for name in FILES))
+            os.path.realpath(path) for path in (self.source, *(folder / name for name in FILES))
         ]
         output = None if self.json == Path("-") else self.json
-        if output is not None and check_output(output).resolve() in files_of_fit:
+        if output is not None and os.path.realpath(check_output(output)) in files_of_fit:
             raise ValueError(
                 f"{output}: expected a new file, got one that the fit has written; choose another "
                 "name."

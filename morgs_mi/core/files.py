@@ -44,7 +44,8 @@ def atomic_path(path: FilePath, place: str, parents: bool = False) -> Generator[
         OSError: raised by the body or the renaming; its sentence begins with `place`, e.g.
             ``write_json()``.
     """
-    final = Path(path).resolve()  # a rename would replace a link, and `.` has no name
+    # A rename would replace a link, except one to itself, and `.` has no name.
+    final = Path(os.path.realpath(path))
     partial = _hidden(final, "partial", os.getpid())
     old = _hidden(final, "old", os.getpid())
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises

@@ -42,7 +42,7 @@ def stream_name(stream: FrameSource) -> str:
     Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser
     cannot contain them.
     """
-    path = stream.path.resolve()
+    path = Path(os.path.realpath(stream.path))  # unlike Path.resolve, also of a link to itself
     name = path.parent.name if path.name == STREAM else path.stem
     return os.fsencode(name).decode(errors="replace")
 

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 from threading import Lock
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,13 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, check_number
+from morgs_mi.core.checks import LARGEST, check_number, require
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.png import png_bytes
 from morgs_mi.playback.player import available_channels, picture
 from morgs_mi.playback.stream_header import (
     fitted_capture,
+    metadata_entry,
     num_frames,
     open_stream_capture,
 )
@@ -80,12 +82,18 @@ class ExactImages:
 
 
 class RecordedImages:
-    """Recorded images by camera and frame, from the capture in `folder` or, where it is None, the
-    one of the fit.
+    """Recorded images by camera and frame.
+
+    Args:
+        folder: capture; None: the one that was fitted, which the `capture.json` beside the stream
+            names. A stream from anybody may name any folder of this machine.
+        is_public: whether other machines can see the images. They are then of a folder that the
+            user names, or of one that has the fingerprint in the stream's header.
     """
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, folder: Path | None, is_public: bool = False) -> None:
         self._folder = folder
+        self._is_public = is_public
         self._capture: Capture | None = None
         self._view = -1
         self._next = 0
@@ -93,11 +101,30 @@ class RecordedImages:
         self._lock = Lock()
 
     def are_present(self, stream: FrameSource) -> bool:
-        """Return whether the folder of the capture is there."""
+        """Return whether the folder of the capture is there, and may be shown."""
         try:
-            return Path(self._folder or fitted_capture(stream)).is_dir()
+            return self._folder_of(stream).is_dir()
         except (OSError, ValueError):
             return False
+
+    def _folder_of(self, stream: FrameSource) -> Path:
+        """Return the folder of the capture.
+
+        Raises:
+            FileNotFoundError: no path is stored, or the folder is not there any more.
+            ValueError: nothing shows that the stream was fitted to it, and the images are public.
+        """
+        if self._folder is not None:
+            return self._folder
+        has_mark = metadata_entry(stream, "fingerprint", None, str, NoneType) is not None
+        require(
+            has_mark or not self._is_public,
+            stream.path,
+            "expected the fingerprint of its recording, because other machines see the images",
+            "none",
+            "name the recording with --capture",
+        )
+        return Path(fitted_capture(stream))
 
     def at(self, stream: FrameSource, view: int, frame: int) -> np.ndarray:
         """Return the image [H, W, 3] of a camera at a frame, undistorted as for the fit.
@@ -116,7 +143,8 @@ class RecordedImages:
             # The capture of a live fit grows.
             if self._capture is None or frame >= self._capture.num_frames:
                 frames = list(range(max(num_frames(stream), last + 1)))
-                self._capture = open_stream_capture(stream, self._folder, frames).displayed()
+                folder = self._folder_of(stream)
+                self._capture = open_stream_capture(stream, folder, frames).displayed()
                 self._view = -1
             if view != self._view or not self._next <= frame < self._next + _NEAR:
                 self._images = self._capture.images(view, frame)

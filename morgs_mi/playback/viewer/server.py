@@ -83,12 +83,12 @@ class Viewer:
         capture: Path | None = None,
     ) -> None:
         self._stream = stream
-        self._path = stream.path.resolve()  # a link may be named, but not replace the file later
+        # A link may be named, but not replace the file later.
+        self._path = Path(os.path.realpath(stream.path))
         if isinstance(stream, SplatFile):
             self._folder = TemporaryDirectory()
             self._path = Path(self._folder.name) / STREAM
             self._path.write_bytes(published_bytes(stream))
-        self._recorded = RecordedImages(capture)
         self._exact = ExactImages(self._opened)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -99,6 +99,7 @@ class Viewer:
             ) from None
         address, port = self._socket.getsockname()[:2]
         self.is_public = not ip_address(address).is_loopback
+        self._recorded = RecordedImages(capture, self.is_public)
         token = secrets.token_urlsafe() if self.is_public else ""
         name = f"[{host}]" if ":" in host else host
         if ip_address(address).is_unspecified:

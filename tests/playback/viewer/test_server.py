@@ -20,6 +20,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from starlette.datastructures import Headers
 
+from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
@@ -28,6 +29,7 @@ from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.extras.live.fit_live import write_images
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.player import channel_image, picture
+from morgs_mi.playback.stream_header import open_stream_capture
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer import access
 from morgs_mi.playback.viewer import images as viewer_images
@@ -498,6 +500,29 @@ def test_viewer__sends_recorded_images_as_jpeg(live):
         (folder / PROVISIONAL).write_bytes(stream.read_bytes())
         stream.write_bytes(stream.read_bytes()[: open_stream(folder).index()[0][2]])
         assert get(url, "recorded/1/0")[0].status == 200
+
+
+@pytest.mark.parametrize(
+    ("mark", "status"), [(None, 400), ("", 400), ("0123456789abcdef", 400), ("right", 200)]
+)
+def test_viewer__shows_other_machines_only_the_recording_that_was_fitted(live, mark, status):
+    """A stream from anybody may name any folder of this machine as its capture."""
+    folder, _, images = live
+    stream = open_stream(folder)
+    if mark == "right":
+        capture = open_stream_capture(stream, None, [0])
+        mark = fingerprint(capture, 3 * [images[0]])
+    metadata = {**stream.metadata, "fingerprint": mark}
+    with StreamWriter(folder / "stream.morgs", stream.cameras, 25, metadata) as writer:
+        writer.write(keyframe_packet(isotropic([[0, 0, 0]], 0.3, 0.9, (1.0, 0, 0)), 0))
+    with viewing(folder, host="0.0.0.0") as url:
+        assert get(url, "recorded/1/0")[0].status == status
+        if mark is None:
+            assert b'data-server=""' in get(url)[1]
+            assert b"expected the fingerprint of its recording" in get(url, "recorded/1/0")[1]
+    if mark is None:
+        with viewing(folder, host="0.0.0.0", capture=folder / "capture") as url:
+            assert get(url, "recorded/1/0")[0].status == 200
 
 
 def test_viewer__names_a_capture_that_is_missing(clip, url, tmp_path):
