@@ -106,11 +106,12 @@ def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], floa
     views = [camera_of_fields(fields, f"cameras[{k}]") for k, fields in enumerate(cameras)]
     # The images are decoded when they are drawn, and then stay in memory.
     sizes = [3 * view.width * view.height for view in views if view.background is not None]
-    if sum(sizes) > most_memory(len(payload)):
+    most = most_memory(len(payload))
+    if sum(sizes) > most:
         raise ValueError(
-            f"`background` of {len(sizes)} cameras claims images of {sum(sizes) / 1e6:.0f} MB, "
-            f"more than {most_memory(len(payload)) / 1e6:.0f} MB for a header of {len(payload)} "
-            "bytes; use a colour, or smaller images"
+            f"`background` of {len(sizes)} cameras must have at most {most // 10**6} MB in a "
+            f"header of {len(payload)} bytes, got claims of {sum(sizes) // 10**6} MB; use a "
+            "colour, or smaller images"
         )
     return tuple(views), fps, metadata
 

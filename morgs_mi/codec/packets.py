@@ -47,6 +47,7 @@ from morgs_mi.codec.quantisation import (
     step_sizes,
 )
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Arrays
 
@@ -194,7 +195,8 @@ def keyframe_packet(
     """
     groups = groups_of(gaussians)
     check_finite(groups)
-    grid = new_grid(groups, cameras, config or CodecConfig())
+    config = config_or_default("keyframe_packet()", config, CodecConfig())
+    grid = new_grid(groups, cameras, config)
     return reemitted_keyframe(
         CodedFrame(frame, np.arange(len(grid), dtype=np.uint32), gaussians, grid, len(grid))
     )
@@ -238,7 +240,7 @@ def residual_packet(
     Raises:
         ValueError: an attribute is not finite.
     """
-    config = config or CodecConfig()
+    config = config_or_default("residual_packet()", config, CodecConfig())
     grid = previous.grid
     source = np.arange(len(grid)) if source is None else np.asarray(source)
     survivors = source[source >= 0]

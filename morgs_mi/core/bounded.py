@@ -144,9 +144,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     """
     text = read_text(path, MAX_TOML)
     has_long_key = _LONG_KEY.search(text) is not None
-    require(
-        not has_long_key, path, "expected keys of at most 20 dots", "more", "nest fewer tables"
-    )
+    require(not has_long_key, path, "expected keys of at most 20 dots", "more", "nest fewer tables")
     with _refusing(path, "TOML", "write it again"):
         return tomllib.loads(text)
 

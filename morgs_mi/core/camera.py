@@ -24,7 +24,7 @@ from morgs_mi.core.checks import (
     numbers,
     require,
 )
-from morgs_mi.core.color_space import unit_values
+from morgs_mi.core.color_space import BRIGHTEST, unit_values
 from morgs_mi.core.png import PngImage
 from morgs_mi.core.types import Tensor
 
@@ -105,14 +105,15 @@ class Camera:
             viewmat = rigid(f"{where}, `viewmat`", numbers(where, "viewmat", viewmat, 4, 4))
         if self.background is not None and not isinstance(self.background, PngImage):
             image = numbers(where, "background", self.background, self.height, self.width, 3)
+            values = unit_values(image, np.float32)
             require(
-                image.dtype == np.uint8 or bounded(image),
+                (np.abs(values) <= BRIGHTEST).all(),
                 where,
-                "`background` must be finite",
-                "NaN or values above 1e12",
+                f"`background` must have numbers from {-BRIGHTEST:g} to {BRIGHTEST:g}, 1 for white",
+                "others",
                 "paint the pixels without one",
             )
-            object.__setattr__(self, "background", unit_values(image, np.float32))
+            object.__setattr__(self, "background", values)
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
 

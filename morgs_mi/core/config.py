@@ -35,6 +35,7 @@ from typing import (
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
 from morgs_mi.core.bounded import read_toml
+from morgs_mi.core.checks import check_type
 from morgs_mi.core.documentation import documented, field_docs, with_pages
 
 NonNegative = Annotated[float, Ge(0)]
@@ -112,6 +113,25 @@ def check_value(place: str, name: str, value: Any, kind: Any) -> None:
     """
     if expected := _expected(value, kind):
         raise ValueError(f"{place}: `{name}` must be {expected}, got {shortened(value)}.")
+
+
+def config_or_default(
+    place: str, config: Config | None, default: Config, name: str = "config"
+) -> Config:
+    """Return the config that a caller passes, or `default` for None.
+
+    Args:
+        place: where the error's sentence begins.
+        config: the argument.
+        default: a config of the type that it must have.
+        name: of the argument.
+
+    Raises:
+        ValueError: it has another type.
+    """
+    result = default if config is None else config
+    check_type(place, name, result, type(default))
+    return result
 
 
 @cache

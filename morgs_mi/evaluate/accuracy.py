@@ -27,6 +27,7 @@ from rich.table import Table
 
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.plots import check_plot, save_plot
@@ -235,7 +236,8 @@ def accuracy(
     Raises:
         ValueError: as `rasterize`.
     """
-    config = replace(config or RenderConfig(), background=None)
+    config = config_or_default("accuracy()", config, RenderConfig())
+    config = replace(config, background=None)
     camera = replace(camera, delay=0, readout=0, background=None)
     gaussians = Gaussians(**gaussians.numpy())
     tensors = [getattr(gaussians, name) for name in ATTRIBUTES]

@@ -20,13 +20,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 from drjit.opt import Adam
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import require
+from morgs_mi.core.checks import (
+    LARGEST,
+    check_mask,
+    check_number,
+    check_type,
+    errors_at,
+    numbers,
+    require,
+)
+from morgs_mi.core.color_space import BRIGHTEST, unit_values
+from morgs_mi.core.config import check_value, config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.core.types import Arrays
@@ -56,6 +67,9 @@ _SPLIT_LONGEST = 0.55
 _SPLIT_OTHERS = 0.893
 # Factor on their opacity.
 _SPLIT_OPACITY = 0.6
+
+
+_Births = Annotated[int, Ge(0), Le(100_000_000)]
 
 
 @dataclass(frozen=True)
@@ -169,6 +183,10 @@ class DensityControl:
         scores: densification scores [N] since the last step, by which parents are chosen; may be
             set, such as to gradients of projected means (`means2d` of `rasterize`). None: none yet.
 
+    Raises:
+        ValueError: neither cameras nor an extent are given, or an argument is of another type or
+            out of range.
+
     Example:
         >>> optimizer = mi.ad.Adam(lr=0.01, params=gaussians.parameters())
         >>> control = morgs_mi.DensityControl(cameras)
@@ -186,6 +204,7 @@ class DensityControl:
         seed: int | np.random.Generator = 0,
         render: RenderConfig | None = None,
     ) -> None:
+        check_type("DensityControl()", "cameras", cameras, Sequence, "pass a list")
         self._cameras = [Camera.of(camera) for camera in cameras]
         require(
             cameras or extent is not None,
@@ -194,10 +213,12 @@ class DensityControl:
             "neither",
             "pass the training views",
         )
-        self._config = config or DensityConfig()
+        self._config = config_or_default("DensityControl()", config, DensityConfig())
         self.extent = scene_extent(self._cameras) if extent is None else extent
-        self._rng = np.random.default_rng(seed)
-        self._render = render or RenderConfig()
+        check_number("DensityControl()", "extent", self.extent, f"(0, {LARGEST:g}]")
+        with errors_at("DensityControl(), `seed`"):
+            self._rng = np.random.default_rng(seed)
+        self._render = config_or_default("DensityControl()", render, RenderConfig(), "render")
         self.scores: np.ndarray | None = None
 
     def observe(
@@ -210,8 +231,19 @@ class DensityControl:
             camera: a `Camera` or a `perspective` sensor.
             image: the recorded image [H, W, 3], sRGB-encoded: uint8, or floats with 1 for white.
             mask: valid pixels [H, W], bool; None: all are.
+
+        Raises:
+            ValueError: the image or the mask is not of the camera's size, or has other values.
         """
+        place = "DensityControl.observe()"
         view = ActiveView(Camera.of(camera), self._render)
+        width, height = view.camera.size
+        image = numbers(place, "image", image, height, width, 3)
+        is_image = (np.abs(unit_values(image)) <= BRIGHTEST).all()
+        requirement = f"`image` must have numbers from {-BRIGHTEST:g} to {BRIGHTEST:g}, 1 for white"
+        require(is_image, place, requirement, "others", "mask such pixels, and set them to 0")
+        if mask is not None:
+            check_mask(place, mask, height, width)
         gaussians = Gaussians.from_parameters(values_of(optimizer))
         self.observe_views(gaussians, [view], [Target(image, mask)])
 
@@ -229,14 +261,18 @@ class DensityControl:
 
         Args:
             optimizer: holds the Gaussians, whose number may change.
-            births: largest number of births.
+            births: largest number of births, 0 to 100 million.
 
         Returns:
             What was done, as indices of the Gaussians before.
 
         Raises:
-            ValueError: an attribute is missing, or the scores are of another number of Gaussians.
+            ValueError: the optimiser is of another kind, an attribute is missing, the number of
+                births is out of range, or the scores are of another number of Gaussians or not
+                finite.
         """
+        check_type("DensityControl.step()", "optimizer", optimizer, Adam, "pass mi.ad.Adam")
+        check_value("DensityControl.step()", "births", births, _Births)
         gaussians = Gaussians.from_parameters(values_of(optimizer))
         plan = plan_growth(
             gaussians,
@@ -268,14 +304,19 @@ class DensityControl:
 
     def _taken_scores(self, count: int) -> np.ndarray:
         """Return the scores, which are used once."""
-        scores = np.zeros(count) if self.scores is None else np.asarray(self.scores)
+        place = "DensityControl.step()"
+        scores = numbers(place, "scores", np.zeros(count) if self.scores is None else self.scores)
         require(
             scores.shape == (count,),
-            "DensityControl.step()",
+            place,
             f"`scores` must be [{count}], one for each Gaussian",
             list(scores.shape),
             "observe the Gaussians that the optimiser has now",
         )
+        is_finite = np.isfinite(scores)
+        index = int(is_finite.argmin())
+        value = f"{scores[index]} at {index}"
+        require(is_finite[index], place, "`scores` must be finite", value, "set other scores")
         self.scores = None
         return scores
 

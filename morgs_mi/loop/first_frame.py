@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import numbers
+from morgs_mi.core.checks import check_type, numbers
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -82,12 +83,13 @@ def fit_gaussians(
     """
     points = np.zeros((0, 3)) if points is None else points
     point_colors = np.full(np.shape(points), 0.5) if point_colors is None else point_colors
+    check_type("fit_gaussians()", "sensors", sensors, Sequence, "pass a list")
     cameras = [Camera.of(sensor) for sensor in sensors]
-    config = config or StreamConfig()
+    config = config_or_default("fit_gaussians()", config, StreamConfig())
     if background is not None:
         behind = np.asarray(background)
-        if behind.ndim == 1:
-            render = replace(config.render, background=tuple(behind.tolist()))
+        if behind.ndim < 2:
+            render = replace(config.render, background=tuple(behind.ravel().tolist()))
             config = replace(config, render=render)
         else:
             numbers("fit_gaussians()", "background", behind, len(cameras), *behind.shape[1:])

@@ -15,6 +15,7 @@ import numpy as np
 from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.checks import check_mask, check_number, check_points, check_type
 from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.budget import check_capacity
@@ -89,8 +90,7 @@ def prepare(
     display_exposure: float | None = None,
 ) -> Setup:
     """Return the data that all frames share; arguments and errors as for `StreamLoop`."""
-    config = StreamConfig() if config is None else config
-    check_type("StreamLoop()", "config", config, StreamConfig)
+    config = config_or_default("StreamLoop()", config, StreamConfig())
     if not isinstance(cameras, Sequence) or not cameras:
         kind = f"a {type(cameras).__name__}" if cameras else "none"
         raise ValueError(

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.checks import valid_pixels
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow_sources.flow_registry import (
@@ -110,7 +111,7 @@ def consistency_mask(
         back: B [H, W, 2], from the other frame to the first, on the other frame's grid.
         config: the two tolerances; None: the defaults above.
     """
-    config = config or FlowConfig()
+    config = config_or_default("consistency_mask()", config, FlowConfig())
     height, width = flow.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x = x + flow[..., 0]

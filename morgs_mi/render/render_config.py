@@ -6,7 +6,10 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
+from morgs_mi.core.color_space import BRIGHTEST
 from morgs_mi.core.config import Positive, config_class
+
+_Encoded = Annotated[float, Ge(-BRIGHTEST), Le(BRIGHTEST)]
 
 
 @config_class
@@ -32,7 +35,7 @@ class RenderConfig:
     first_order_motion: bool = False
     """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the
     difference of two projections. The relative difference is motion in depth / depth."""
-    background: tuple[float, float, float] | None = None
+    background: tuple[_Encoded, _Encoded, _Encoded] | None = None
     """Colour behind all Gaussians, encoded: 1 is white. None: black."""
     block_width: Annotated[int, Ge(4), Le(16), MultipleOf(4)] | None = None
     """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4.

@@ -17,6 +17,7 @@ from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.points import dense_points, match_capture, triangulate_points
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.extras import extra
 from morgs_mi.core.files import locked_folder
 from morgs_mi.core.gaussians import Gaussians
@@ -100,7 +101,7 @@ def stream_capture(
         capture or other settings; or images, Gaussians or steps that do not fit in memory.
     """
     out = Path(out)
-    config = config or StreamConfig()
+    config = config_or_default("stream_capture()", config, StreamConfig())
     check_outputs(out)
     check_capacity(
         "stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit

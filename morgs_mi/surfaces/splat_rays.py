@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import ActivatedGaussians, require_some
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Jit, UInt32
@@ -168,7 +169,7 @@ class SplatRays:
 
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
         require_some("SplatRays()", gaussians, "pass some")
-        self._config = config or RenderConfig()
+        self._config = config_or_default("SplatRays()", config, RenderConfig())
         names = ("means", "scales", "quats", "opacities", "sh_coeffs")
         means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))

@@ -79,6 +79,67 @@ def test_density_control__refuses_scores_of_other_gaussians_and_missing_paramete
         DensityControl()
 
 
+@pytest.mark.parametrize("births", [-1, None, 1e9, 10**9, 1.5, "1", True, np.nan])
+def test_density_control__refuses_absurd_births(births):
+    with pytest.raises(
+        ValueError, match=r"step\(\): `births` must be .*at least 0 and at most 1000"
+    ):
+        DensityControl([CAMERA]).step(optimizer_of(splats()), births)
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [
+        ([1, np.nan, 0], "`scores` must be finite, got nan at 1"),
+        ([1, 0, -np.inf], "`scores` must be finite, got -inf at 2"),
+        (["a", "b", "c"], "`scores` must be an array of real numbers, got"),
+    ],
+)
+def test_density_control__refuses_absurd_scores(scores, message):
+    control = DensityControl([CAMERA])
+    control.scores = scores
+    with pytest.raises(ValueError, match=rf"^DensityControl.step\(\): {message}"):
+        control.step(optimizer_of(splats()), births=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"extent": -1}, r": `extent` must be a number in \(0, 1e\+12\], got -1"),
+        ({"extent": 0}, r": `extent` must be a number in \(0, 1e\+12\], got 0"),
+        ({"extent": np.nan}, r": `extent` must be a number in \(0, 1e\+12\], got nan"),
+        ({"extent": np.inf}, r": `extent` must be a number in \(0, 1e\+12\], got inf"),
+        ({"extent": "1"}, r": `extent` must be a number in \(0, 1e\+12\], got '1'"),
+        ({"config": {}}, r": `config` must be a .*DensityConfig, got a dict"),
+        ({"render": {}}, r": `render` must be a .*RenderConfig, got a dict"),
+        ({"cameras": None}, r": `cameras` must be a .*Sequence, got a NoneType"),
+        ({"seed": "x"}, ", `seed`: "),
+    ],
+)
+def test_density_control__refuses_absurd_arguments(arguments, message):
+    with pytest.raises(ValueError, match=rf"^DensityControl\(\){message}"):
+        DensityControl(**{"cameras": [CAMERA], **arguments})
+
+
+@pytest.mark.parametrize(
+    ("image", "mask", "message"),
+    [
+        (None, None, r"`image` must be an array of real numbers \[36, 48, 3\], got None"),
+        (np.zeros((36, 48)), None, r"`image` must be .* \[36, 48, 3\], got float64 \[36, 48\]"),
+        (np.full((36, 48, 3), np.nan), None, "`image` must have numbers from -32 to 32, 1 for whi"),
+        (np.zeros((36, 48, 3)), np.ones((2, 2), bool), r"the mask must be bool \[36, 48\]"),
+    ],
+)
+def test_density_control__refuses_absurd_images(image, mask, message):
+    with pytest.raises(ValueError, match=rf"^DensityControl.observe\(\): {message}"):
+        DensityControl([CAMERA]).observe(optimizer_of(splats()), CAMERA, image, mask)
+
+
+def test_density_control__refuses_what_is_no_adam():
+    with pytest.raises(ValueError, match=r"step\(\): `optimizer` must be a .*Adam, got a dict"):
+        DensityControl([CAMERA]).step(splats().parameters(), births=1)
+
+
 def test_update_ellipsoids__follows_another_number_of_gaussians_with_gradients():
     shape = morgs_mi.ellipsoids(splats())
     integrator = {"type": "gaussian_splat", "srgb_primitives": False}

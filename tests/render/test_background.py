@@ -78,8 +78,28 @@ def test_camera__resizes_and_refuses_backgrounds():
     assert_close(bytes_behind.resized(24, 16).background, np.ones((16, 24, 3)))
     with pytest.raises(ValueError, match=r"`background` must be .* \[33, 48, 3\], got float64 \[4"):
         replace(CAMERA, background=np.zeros((4, 4, 3)))
-    with pytest.raises(ValueError, match="`background` must be finite"):
+    with pytest.raises(ValueError, match="`background` must have numbers from -32 to 32, 1 for wh"):
         replace(CAMERA, background=np.full((H, W, 3), np.nan))
+    with pytest.raises(ValueError, match="`background` must have numbers from -32 to 32, 1 for wh"):
+        replace(CAMERA, background=np.full((H, W, 3), 1e11))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"config": {}}, r"fit_gaussians\(\): `config` must be a .*StreamConfig, got a dict"),
+        ({"sensors": None}, r"fit_gaussians\(\): `sensors` must be a .*Sequence, got a NoneType"),
+        (
+            {"background": 3 * (1e30,)},
+            "`background` must be a list, each item .* at most 32.0, got",
+        ),
+        ({"background": 1.0}, r"`background` must be a list of 3 items, got \(1.0,\)"),
+        ({"background": np.full((1, H, W, 3), 1e11)}, "`background` must have numbers from -32 to"),
+    ],
+)
+def test_fit_gaussians__refuses_absurd_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        fit_gaussians(**{"sensors": [CAMERA], "images": [IMAGE], **arguments})
 
 
 def test_fit_gaussians__equals_the_loop_over_a_colour_and_over_images():

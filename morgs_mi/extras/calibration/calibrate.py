@@ -38,7 +38,7 @@ from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import few, require, valid_pixels
 from morgs_mi.core.color_space import display_image, display_stops
-from morgs_mi.core.config import check_ranges
+from morgs_mi.core.config import check_ranges, config_or_default
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.png import png_bytes
 from morgs_mi.core.progress import Report
@@ -179,7 +179,7 @@ def calibrate(
         OSError: the model cannot be written.
     """
     path = Path(path)
-    config = config or CalibrateConfig()
+    config = config_or_default("calibrate()", config, CalibrateConfig())
     check_ranges(config, "calibrate()")
     report = progress or (lambda *_: None)
     if not path.is_dir():

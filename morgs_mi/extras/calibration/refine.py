@@ -39,6 +39,7 @@ from morgs_mi.capture.features import detect, intersect, join_matches, match_vie
 from morgs_mi.capture.lens import Lens, undistorted, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
 from morgs_mi.core.random_streams import Stream, rng_of
@@ -186,7 +187,8 @@ def refine_cameras(
     Raises:
         ValueError: fewer than two training views have an image of the first frame.
     """
-    problem = _Problem.of(capture, config, render or RenderConfig(), seed)
+    render = config_or_default("refine_cameras()", render, RenderConfig(), "render")
+    problem = _Problem.of(capture, config, render, seed)
     deviations = prior_deviations(problem.extent, config.camera_priors)
     bundle_changes, tracks, deviations = _matched(capture, problem.indices, deviations)
     has_rival = config.refine_cameras == "auto"

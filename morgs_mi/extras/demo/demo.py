@@ -15,6 +15,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import REPORT, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report, Steps
@@ -88,7 +89,7 @@ def run_demo(
             exists and is not a synthetic capture.
     """
     root = check_output(Path(out))
-    config = config or DemoConfig()
+    config = config_or_default("run_demo()", config, DemoConfig())
     seconds: dict[str, float] = {}
 
     def run_step(name: str, work: Callable[[Progress], Any]) -> Any:

@@ -27,6 +27,7 @@ from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number, errors_at, require
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.files import STREAM, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Steps
@@ -89,7 +90,7 @@ def import_frames(
         OSError: the stream cannot be written.
     """
     check_number("import_frames()", "fps", fps, "[1e-6, 1e6]")
-    config = config or CodecConfig()
+    config = config_or_default("import_frames()", config, CodecConfig())
     paths = find_frames(sources)
     path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / STREAM
     if path.exists():

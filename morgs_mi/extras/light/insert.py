@@ -37,7 +37,7 @@ from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number, check_type, few, numbers, require
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
-from morgs_mi.core.config import Count, config_class
+from morgs_mi.core.config import Count, config_class, config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
 from morgs_mi.core.memory import from_numpy
@@ -174,7 +174,7 @@ def render_inserted(
     Raises:
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
     """
-    config = config or InsertConfig()
+    config = config_or_default("render_inserted()", config, InsertConfig())
     if config.clipped is None:
         config = replace(config, clipped=1.0 if "transfer" in stream.metadata else CLIPPED)
     view = camera.square()

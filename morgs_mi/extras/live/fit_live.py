@@ -26,6 +26,7 @@ from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.config import config_or_default
 from morgs_mi.core.files import CAPTURE, atomic_path, locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.png import png_bytes
@@ -97,7 +98,8 @@ def fit_live(
             calibrated or do not have the calibrated sizes.
     """
     out = Path(out)
-    live = live or LiveConfig()
+    live = config_or_default("fit_live()", live, LiveConfig(), "live")
+    config = config_or_default("fit_live()", config, LIVE_STREAM)
     live.check()
     check_outputs(out)
     folder = out / "capture"
@@ -127,9 +129,8 @@ def fit_live(
             raise ValueError("fit_live(): expected images of the cameras, got none.")
         report("Waiting for the cameras", 1, 1)
         capture = begin_capture(folder, feed.names, first.images, live, calibration, on_stage)
-        return _fit(
-            _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
-        )
+        frames = _LiveFrames(feed, capture, first, live)
+        return _fit(frames, out, config, on_frame, report)
 
 
 def begin_capture(

@@ -28,7 +28,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.config import Count, apply_values, check_value
+from morgs_mi.core.config import Count, apply_values, check_value, config_or_default
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
@@ -152,7 +152,7 @@ def sweep(
         ValueError: a number is too small, a preset is unknown, or as `stream_capture`.
         OSError: as `stream_capture`.
     """
-    config = config or StreamConfig()
+    config = config_or_default("sweep()", config, StreamConfig())
     arms = []
     for preset in presets:
         method = config if preset == "default" else apply_preset(config, preset)
@@ -202,7 +202,7 @@ def leave_out(
         ValueError: as `sweep`.
         OSError: as `sweep`.
     """
-    config = config or StreamConfig()
+    config = config_or_default("leave_out()", config, StreamConfig())
     common = (config, capture, seeds, frames, Path(out), progress)
 
     def without(parts: Sequence[str]) -> Arm:

@@ -25,7 +25,7 @@ from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import require
-from morgs_mi.core.config import check_ranges
+from morgs_mi.core.config import check_ranges, config_or_default
 from morgs_mi.core.files import CAPTURE, atomic_path, write_json
 from morgs_mi.core.memory import check_memory
 from morgs_mi.core.progress import Steps
@@ -100,7 +100,7 @@ def synthesize(
         repr(mi.variant()),
         'call mitsuba.set_variant("llvm_ad_rgb") first',
     )
-    config = config or SynthConfig()
+    config = config_or_default("synthesize()", config, SynthConfig())
     check_ranges(config, "synthesize()")
     check_memory(
         "synthesize()",

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
+from morgs_mi.core.config import config_or_default
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
     FlowConfig,
@@ -101,7 +102,7 @@ def optical_flow(
         method: a key of `FLOW_METHODS`.
         config: settings of the methods; None: the defaults.
     """
-    config = config or FlowConfig()
+    config = config_or_default("optical_flow()", config, FlowConfig())
     if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
     a, b = (np.ascontiguousarray(byte_values(each)) for each in (image, previous))
