@@ -357,7 +357,10 @@ def load_capture(
     path = Path(path)
     if not path.is_dir():
         kind = "a file" if path.is_file() else "none"
-        raise FileNotFoundError(f"{path}: expected a capture folder, found {kind}; check the path.")
+        raise FileNotFoundError(
+            f"{path}: expected a capture folder, with a video or a folder of images for each "
+            f"camera, found {kind}; check the path."
+        )
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:

@@ -26,8 +26,8 @@ class Accuracy:
     source: Positional[Path]
     """File of Gaussians, .ply, .compressed.ply or .splat, folder of a fit, or a stream file."""
     output: Annotated[Positional[Path | None], place("FILE.png")] = None
-    """Plot, beside which a .json has all results; by default OUT/NAME-accuracy.png. Needs the extra
-    plots.
+    """Plot, beside which a .json has all results; by default stream-accuracy.png or
+    FILE-accuracy.png beside SOURCE. Needs the extra plots.
     """
     camera: Annotated[str | None, optional("CAMERA")] = None
     """Camera by index or name; by default the first one, for a file of Gaussians the one with most

@@ -75,11 +75,6 @@ def naming_output() -> Iterator[None]:
         raise OSError(error.errno, error.strerror, STDOUT) from error
 
 
-def quantity(count: int, noun: str) -> str:
-    """Return a number of things in words, such as ``2 frames``."""
-    return f"{count} {noun if count == 1 else noun + 's'}"
-
-
 def print_result(text: str, style: str = "") -> None:
     """Print to standard output; on a terminal, lines are wrapped between words, in a style of Rich.
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from morgs_mi.cli.console import quantity
 from morgs_mi.cli.settings import (
     ChannelName,
     DisplayExposure,
@@ -30,6 +29,7 @@ from morgs_mi.cli.streams import (
     relative_to,
     shown_exposure,
 )
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.extras import extra, places
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
@@ -45,8 +45,8 @@ class Ply(ExportKind):
     """
 
     output: Annotated[Positional[Path | None], place("FOLDER")] = None
-    """New folder for 0000.ply, ..., or FILE.ply for one frame, by default OUT/ply; a folder whose
-    name ends in compressed-ply, or FILE.compressed.ply, for PlayCanvas' layout.
+    """New folder for 0000.ply, ..., or FILE.ply for one frame, by default ply beside the stream; a
+    folder whose name ends in compressed-ply, or FILE.compressed.ply, for PlayCanvas' layout.
     """
     frames: Annotated[str | None, FRAMES] = None
 
@@ -65,7 +65,7 @@ class Flight(ExportKind):
     """Render a stream along a moving camera into an mp4."""
 
     output: Annotated[Positional[Path | None], place("FILE.mp4")] = None
-    """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
+    """File for the video; by default PATH.mp4, such as between.mp4, beside the stream."""
     path: Annotated[str, arg(metavar="PATH")] = "between"
     """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file
     (docs/exports.md).
@@ -132,7 +132,7 @@ class Web(ExportKind):
 
     output: Annotated[Positional[Path | None], place("FILE.html")] = None
     """FILE.html, or a new folder with the page, the stream and a module for three.js, for hosting;
-    by default OUT/player.html or OUT/web."""
+    by default player.html or web beside the stream."""
     title: Annotated[str | None, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
     front: Front = None

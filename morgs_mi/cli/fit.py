@@ -24,6 +24,7 @@ from morgs_mi.cli.settings import (
     optional,
     options,
 )
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.config import Count, check_value, config_toml
 from morgs_mi.core.files import STREAM
 from morgs_mi.core.progress import duration
@@ -94,8 +95,10 @@ class Fit:
             return
         if self.capture is None or self.out is None:
             raise ValueError(
-                "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before "
-                "options with several values, such as --hold-out, and see morgs-mi fit --help."
+                "morgs-mi fit: expected two folders, CAPTURE with a video or a folder of images "
+                f"for each camera, and OUT for the result, got {self.capture or 'none'}; give both "
+                "before options with several values, such as --hold-out. `morgs-mi demo OUT` makes "
+                "a capture and fits it."
             )
         if self.chunks is not None:
             check_value("fit()", "chunks", self.chunks, Count)
@@ -143,7 +146,7 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     seconds = [row.seconds for row in reports[1:]]
     later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
-        f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
+        f"{stream}: {quantity(len(reports), 'frame')}, {stream.stat().st_size / 1e6:.1f} MB, "
         f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} "
         f"steps){later}."
     )
@@ -152,7 +155,7 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     if problems := [row for row in reports if row.status != "ok"]:
         row = problems[0]
         print_result(
-            f"{len(problems)} of {len(reports)} frames have a problem (status in report.json), "
+            f"Frames with a problem (status in report.json): {len(problems)} of {len(reports)}; "
             f"frame {row.frame}: {row.status.rstrip('.')}."
         )
 
@@ -189,6 +192,7 @@ def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
             if resume or stream.stat().st_mtime >= begin:
                 span = "no frame yet"
                 if index := StreamReader(stream).index():
-                    span = f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`"
+                    done = quantity(index[-1][1] + 1, "frame")
+                    span = f"{done} of {count}; continue with `--resume`"
                 error.add_note(f"{stream} holds {span}.")
         raise

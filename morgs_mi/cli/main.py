@@ -19,6 +19,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import version
 from io import StringIO, TextIOWrapper
@@ -38,7 +39,7 @@ from morgs_mi.cli.console import (
     sentence_of,
 )
 from morgs_mi.cli.evaluate import Eval
-from morgs_mi.cli.export import Export
+from morgs_mi.cli.export import EXPORTS, Export
 from morgs_mi.cli.fit import Fit
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import (
@@ -54,6 +55,8 @@ from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
 # Exit status of a shell for a program whose reader has ended, such as `head`.
 _CLOSED = 141
+# Exit status for arguments that the parser would reject.
+_REJECTED = 2
 # The class of each command, in the order of the help: a dataclass of its options, with `run`.
 COMMANDS = {
     "fit": Fit,
@@ -63,6 +66,23 @@ COMMANDS = {
     "eval": Eval,
     "accuracy": Accuracy,
     **{name: extra("commands", name) for name in places("commands")},
+}
+
+# Options that went, and what to do instead.
+OLD_OPTIONS = {
+    "--animation": "went: scene files pose meshes by functions of the time (docs/scenes.md)",
+    "--color": "went: --exposure balances the cameras",
+    "--completion": "is now --tyro-write-completion bash FILE",
+    "--deep": "went: `info` checks the poses, and --time finds the time offsets",
+    "--format": "went: the name of the output determines the format",
+    "--key-views": "is now `key_views` in `[motion]` of a file of settings (--config)",
+    "--open-browser": "is now --browser",
+    "--no-open-browser": "is now --no-browser",
+    "--reproducible": "went: every fit on a CPU is reproducible; leave it out",
+    "--segments": "is now --chunks",
+    "--test-view": "is now --hold-out",
+    "--validate": "went: the time of its trials is left to the first frame; leave it out",
+    "--without": "is now --exclude",
 }
 
 
@@ -121,6 +141,9 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
                 tyro.conf.PositionalMetavarFromFieldName,
             ),
         )
+        if options_type is Options and (mistake := _mistake(args)):
+            print_warning(f"{prog}: {mistake}")
+            return _REJECTED
         options: Any = _help(parse, args) if {"-h", "--help"} & {*args} else parse()
         command = options.command
         _set_up(options)
@@ -148,6 +171,27 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             ERR.print_exception()
         _drop_output()
         return INTERRUPTED if is_interruption(error) else 1
+
+
+def _mistake(args: Sequence[str]) -> str:
+    """Return a sentence on an option that went, or on a command that does not exist; empty if the
+    arguments have neither.
+    """
+    for word in args:
+        option = word.partition("=")[0].replace("_", "-")
+        if option in OLD_OPTIONS:
+            return f"{option} {OLD_OPTIONS[option]}."
+    names = COMMANDS
+    words = args
+    if args[:1] == ["export"]:
+        names = EXPORTS
+        words = args[1:]
+    word = next(iter(words), "-")
+    if word.startswith("-") or word in names:
+        return ""
+    similar = get_close_matches(word, names, 1)
+    question = f"did you mean {similar[0]}?" if similar else "see morgs-mi --help."
+    return f"expected one of {', '.join(names)}, got {word}; {question}"
 
 
 def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from morgs_mi.cli.console import print_result, progress, quantity
+from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, options
 from morgs_mi.cli.streams import Background, DropInvalid, on_background, opened, shown_exposure
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.extras import extra
 from morgs_mi.playback.export.formats import IMAGES, destination
 
@@ -36,8 +37,8 @@ class Render:
     ] = None
     """FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for
     multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels,
-    confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, with
-    the name of the camera or the path.
+    confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default CAMERA.mp4 or PATH.mp4,
+    such as orbit.mp4, beside the stream; of a file of Gaussians, FILE-orbit.mp4 beside it.
     """
     camera: Annotated[str | None, optional("CAMERA")] = None
     """Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A

@@ -30,6 +30,7 @@ from morgs_mi.codec.container import (
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.core.bounded import open_regular
+from morgs_mi.core.checks import quantity
 
 _READ_SIZE = 2**20
 
@@ -94,11 +95,10 @@ class StreamReader(FrameSource):
             self._playable_entries, self.skipped = self._playable()
 
     def __repr__(self) -> str:
-        frames = f"{self.metadata['num_frames']} frames, " if "num_frames" in self.metadata else ""
-        return (
-            f"{type(self).__name__}('{self.path}', {frames}{len(self.cameras)} cameras, "
-            f"{self.fps:g} frames per second)"
-        )
+        parts = [quantity(len(self.cameras), "camera"), f"{self.fps:g} frames per second"]
+        if "num_frames" in self.metadata:
+            parts.insert(0, quantity(self.metadata["num_frames"], "frame"))
+        return f"{type(self).__name__}('{self.path}', {', '.join(parts)})"
 
     def __iter__(self) -> Iterator[Packet]:
         return self._packets(1, self._first)
@@ -322,9 +322,8 @@ class StreamReader(FrameSource):
     def _sentence(self, number: int, at: int, problem: str, last: int | None = None) -> str:
         """Return the message of a problem; `last` is the frame of the packet before it."""
         frames = "" if last is None else f", up to frame {last}"
-        return (
-            f"{self._place(number, at)}: {problem}; {number} packets before it are intact{frames}."
-        )
+        before = quantity(number, "packet")
+        return f"{self._place(number, at)}: {problem}; {before} before it can be read{frames}."
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"

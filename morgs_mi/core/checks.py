@@ -163,6 +163,11 @@ def few(names: Sequence[Any] | np.ndarray, most: int = 10) -> str:
     return ", ".join(map(str, names[:most])) + (f" and {rest} more" if rest > 0 else "")
 
 
+def quantity(count: int, noun: str) -> str:
+    """Return a number of things in words, such as ``2 frames``."""
+    return f"{count} {noun if count == 1 else noun + 's'}"
+
+
 def kind_of(value: Any) -> str:
     """Return the numbers and the shape of an array in words, or the name of another type."""
     return (

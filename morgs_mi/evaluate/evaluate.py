@@ -12,6 +12,7 @@ import numpy as np
 
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.core.bounded import read_json
+from morgs_mi.core.checks import require
 from morgs_mi.core.files import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Steps
@@ -24,7 +25,7 @@ from morgs_mi.evaluate.measures import (
 )
 from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
 from morgs_mi.playback.player import playback_speed
-from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.streams import PlayableStream, open_stream
 
 _UNKNOWN = (None, 0, ())  # Of a frame without a report.
 
@@ -58,6 +59,13 @@ def evaluate_stream(
             or the true tracks are broken.
     """
     stream = open_stream(out)
+    require(
+        isinstance(stream, PlayableStream),
+        stream.path,
+        "expected the stream of a fit, to compare with the images that were fitted",
+        "a file of Gaussians",
+        "name the folder of a fit; `morgs-mi accuracy` compares renderings of such a file",
+    )
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
     fitted = _fitted(stream.path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from morgs_mi.core.checks import quantity
 from morgs_mi.method.exposure import Exposure
 
 
@@ -47,5 +48,6 @@ class FrameReport:
     fingerprints: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"
+        gaussians = quantity(self.num_gaussians, "Gaussian")
+        size = f"{gaussians}, {self.num_bytes} bytes, {self.seconds:.1f} s"
         return f"FrameReport(frame {self.frame}, {size}, {self.status})"

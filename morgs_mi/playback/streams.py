@@ -14,7 +14,7 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.checks import errors_at
+from morgs_mi.core.checks import errors_at, require
 from morgs_mi.core.files import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
@@ -102,12 +102,20 @@ def stream_path(out: str | Path) -> Path:
                 f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
                 f"one, such as {path / frames[0]}, or run `morgs-mi import`."
             )
+    remedy = f"if {path} is a capture, fit it first: morgs-mi fit {path} OUT"
     path = path / STREAM if path.is_dir() else path
-    existing_file(path, "a stream", "fit a capture first")
+    existing_file(path, "a stream", remedy)
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
     if start != MAGIC:
         refuse_foreign(path)
+        require(
+            suffix_of(path) or path.suffix == ".morgs",
+            path,
+            "expected a stream, or Gaussians as .ply, .compressed.ply or .splat",
+            "another kind of file",
+            "name the folder of a fit, or fit a capture first",
+        )
     return path
 
 

@@ -5,20 +5,25 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from morgs_mi.cli.export import EXPORTS
 from morgs_mi.cli.main import main
+from morgs_mi.codec.container import MAGIC
+from morgs_mi.core.checks import quantity
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.export.formats import VIDEO, WEB, destination
 from morgs_mi.playback.streams import stream_path
+from tests.cli.commands import assert_refused
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
 
 
 def test_stream_path__finds_the_fit_in_a_folder(tmp_path):
     for name in ("stream", "stream_plain"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "stream.morgs").write_bytes(b"\x89MORGS\r\n")
+        (tmp_path / name / "stream.morgs").write_bytes(MAGIC)
     assert stream_path(tmp_path).parent == tmp_path / "stream"
     (tmp_path / "stream").rename(tmp_path / "other")
     with pytest.raises(FileNotFoundError, match="expected a stream, found none"):
@@ -36,6 +41,48 @@ def test_destination__is_named_after_its_source(tmp_path):
         for formats in (WEB, VIDEO)
     ]
     assert names == ["guitar-player.html", "guitar-orbit.mp4", "player.html", "orbit.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (("render", "a.ply", "--path", "orbi"), ("orbi", "(orbit, between or a JSON file)")),
+        (("export", "video", "a.ply", "--path", "orbi"), ("(orbit, between or a JSON file)",)),
+        (("render", "picture.png"), ("picture.png: expected a stream, or Gaussians as .ply",)),
+        (("info", "clip.mp4"), ("clip.mp4: expected a stream, or Gaussians as .ply",)),
+        (("eval", "a.ply"), ("a.ply: expected the stream of a fit", "morgs-mi accuracy")),
+        (("view", "clip"), ("if clip is a capture, fit it first: morgs-mi fit clip OUT",)),
+        (
+            ("render", "a.ply", "a.gif"),
+            ("FILE.mp4 or FILE.exr or FILE.png", "got '.gif'; name"),
+        ),
+        (("fit",), ("CAPTURE with a video or a folder of images for each camera", "got none")),
+        (("fit", "clip.mp4"), ("for each camera", "OUT for the result, got clip.mp4")),
+        (("fit", "clip.mp4", "out"), ("a folder of images for each camera, found a file",)),
+    ],
+)
+def test_commands__name_what_was_expected_in_a_first_mistake(
+    words, parts, tmp_path, run, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    write_ply("a.ply", to_gaussians(make_unit_scene()))
+    Path("picture.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    Path("clip.mp4").touch()
+    Path("clip").mkdir()
+    assert_refused(run(*words), *parts)
+    assert not Path("out").exists()
+
+
+def test_commands__name_no_folder_in_the_help_that_they_have_no_argument_for(capsys):
+    places = (["render"], ["accuracy"], *(["export", name] for name in EXPORTS))
+    for words in places:
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
+        assert "OUT/" not in capsys.readouterr().out
+
+
+def test_quantity__has_a_plural_unless_it_is_one():
+    assert [quantity(count, "frame") for count in range(3)] == ["0 frames", "1 frame", "2 frames"]
 
 
 def test_info__describes_a_file_of_gaussians(tmp_path, capsys):

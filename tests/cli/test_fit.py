@@ -76,7 +76,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
     assert status == 1
     sentence = error.splitlines()[-1]
     assert sentence.startswith(f"frame {last + 1}: expected an image of at least one fitted camera")
-    assert f"holds frames 0 to {last} of 12; continue with `morgs-mi fit" in sentence
+    assert f"holds {last + 1} frames of 12; continue with `morgs-mi fit" in sentence
     (tmp_path / "away").rename(clip)
     assert run(*fit, "--resume")[0] == 0
     assert run("fit", clip, tmp_path / "whole", *fit[3:])[0] == 0
@@ -189,7 +189,7 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     stands = (
-        f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with "
+        f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds 2 frames of 3; continue with "
         f"`{again}`."
     )
     assert status == 130
@@ -265,10 +265,8 @@ def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_c
     (first, second) = read_json(tmp_path / "out" / "report.json")["frames"]
     assert (status, second["status"]) == (0, "ok")
     assert "the image is black; cut such frames off" in first["status"]
-    assert (
-        f"1 of 2 frames have a problem (status in report.json), frame 0: {first['status']}."
-        in output
-    )
+    assert "Frames with a problem (status in report.json): 1 of 2; frame 0: " in output
+    assert f"{first['status']}.\n" in output
     assert first["validation"]["sentence"] in " ".join(output.split())
 
 

@@ -1,6 +1,7 @@
 """`morgs-mi --version`, completion of a shell, and commands and presets that are listed."""
 
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -8,8 +9,10 @@ from typing import get_args
 
 import pytest
 
-from morgs_mi.cli.main import main
+from morgs_mi.cli.export import EXPORTS
+from morgs_mi.cli.main import COMMANDS, OLD_OPTIONS, main
 from morgs_mi.loop.stream_config import PresetName
+from tests.cli.commands import assert_one_sentence
 
 
 def test_main__prints_the_version(run):
@@ -39,14 +42,34 @@ def test_main__writes_the_completion_of_a_shell(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "commands"),
-    [(["export", "plly", "out"], "ply, video, web, gltf, usd")],
+    ("words", "parts"),
+    [
+        (["rendr", "a.ply"], ("morgs-mi: expected one of fit, render, ", "did you mean render?")),
+        (["frobnicate"], ("got frobnicate; see morgs-mi --help.",)),
+        (["export", "gltff"], ("expected one of ply, video, web, gltf, usd", "did you mean gltf?")),
+        (["fit", "a", "b", "--test-view", "0"], ("--test-view is now --hold-out.",)),
+        (["info", "a", "--without=cam0"], ("--without is now --exclude.",)),
+        (["fit", "a", "b", "--segments", "2"], ("--segments is now --chunks.",)),
+        (
+            ["fit", "a", "b", "--reproducible"],
+            ("every fit on a CPU is reproducible",),
+        ),
+        (["fit", "a", "b", "--key_views", "4"], ("`key_views` in `[motion]`",)),
+    ],
 )
-def test_main__lists_the_commands_in_place_of_a_mistyped_one(words, commands, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(words)
-    assert stop.value.code == 2
-    assert commands in capsys.readouterr().err
+def test_main__names_the_command_or_option_that_was_meant(words, parts, run):
+    status, output, error = run(*words)
+    assert (status, output) == (2, "")
+    assert_one_sentence(error, *parts)
+
+
+def test_old_options__are_options_of_no_command(capsys):
+    for words in (*([name] for name in COMMANDS), *(["export", name] for name in EXPORTS)):
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
+        options = re.findall(r"^  (?:-\w, )?(--[\w-]+)", capsys.readouterr().out, re.MULTILINE)
+        assert "--debug" in options
+        assert not {*options} & {*OLD_OPTIONS}
 
 
 def test_fit__lists_all_presets_in_its_help(capsys):

@@ -69,7 +69,7 @@ def test_main__runs_as_a_module():
         [sys.executable, "-m", "morgs_mi", "fit"], capture_output=True, text=True, check=False
     )
     assert (result.returncode, result.stdout) == (1, "")
-    assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
+    assert_one_sentence(result.stderr, "expected two folders, CAPTURE with")
 
 
 def writing_commands(capture, stream, place):
@@ -167,7 +167,7 @@ def test_main__names_a_missing_empty_or_truncated_stream(stream, tmp_path, run):
     )
     assert_refused(run("eval", stream), "expected the path of its capture", "--capture")
     stream.write_bytes(stream.read_bytes()[:-75])
-    parts = ("truncated or still written", "packet 2", "2 packets before it are intact")
+    parts = ("truncated or still written", "packet 2", "2 packets before it can be read")
     assert_refused(run("render", stream, tmp_path / "a.mp4", "--camera", 0), str(stream), *parts)
     with StreamWriter(stream, rig(), 25):
         pass

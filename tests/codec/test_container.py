@@ -129,9 +129,8 @@ def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path):
         if length in ends:
             got.extend(StreamReader(path))
         else:
-            with pytest.raises(
-                TruncatedStreamError, match=rf"s: packet {intact} at byte \d+: .*; {intact} packets"
-            ):
+            place = rf"s: packet {intact} at byte \d+: .*; {intact} packet"
+            with pytest.raises(TruncatedStreamError, match=place):
                 got.extend(StreamReader(path))
         assert len(got) == max(intact - 1, 0)
 
@@ -221,7 +220,7 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path):
     path.write_bytes(preamble + sealed(b"{}", kind=0))
     with pytest.raises(
         ValueError,
-        match=r"packet 0 at byte 12: `cameras` must be a list .*; 0 packets before it are intact",
+        match=r"packet 0 at byte 12: `cameras` must be a list .*; 0 packets before it can be read",
     ):
         StreamReader(path)
     with pytest.raises(FileNotFoundError):

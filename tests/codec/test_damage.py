@@ -66,7 +66,7 @@ def test_stream_reader__names_packet_byte_and_frame_of_damage(clip, tmp_path):
     place = f"s: packet 3 at byte {clip.pieces[4].start}: its CRC should be "
     with pytest.raises(
         ValueError,
-        match=f"{place}.*: the bytes are damaged; 3 packets before it are intact, up to frame 1",
+        match=f"{place}.*: the bytes are damaged; 3 packets before it can be read, up to frame 1",
     ):
         list(coded_frames(StreamReader(tmp_path / "s")))
 

@@ -21,7 +21,6 @@ from morgs_mi.cli.console import (
     print_table,
     print_warning,
     progress,
-    quantity,
 )
 from morgs_mi.cli.settings import (
     Flag,
@@ -32,6 +31,7 @@ from morgs_mi.cli.settings import (
     options,
 )
 from morgs_mi.cli.streams import opened
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.files import STREAM
 from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.calibrate import CalibrateConfig
@@ -91,7 +91,7 @@ class Info:
             return
         capture = load_capture(self.capture, reading=self.reading.read_config())
         count = len(capture.points)
-        points = f"{count} points" if count else "without points"
+        points = quantity(count, "point") if count else "without points"
         rig_check = None
         if self.check:
             with progress() as report:
@@ -107,13 +107,15 @@ class Info:
         if rig_check is not None:
             error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
             print_result(
-                f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} "
-                f"pairs; {rig_check.advice}"
+                f"Reprojection check: {error}{rig_check.matches} matches in "
+                f"{quantity(rig_check.pairs, 'pair')}; {rig_check.advice}"
             )
             for line in _advice_lines(rig_check.cameras):
                 print_result(line)
         truth = "with ground truth" if capture.truth else "without ground truth"
-        print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        print_result(
+            f"{quantity(capture.num_frames, 'frame')} at {capture.fps:g} fps, {points}, {truth}."
+        )
         for note in capture.notes:
             print_result(note)
         dispensable = ("centre, px", "size", "focal, px", "seen")

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from morgs_mi.cli.console import quantity
 from morgs_mi.cli.settings import (
     Flag,
     options,
     place,
 )
 from morgs_mi.cli.streams import FRAMES, ExportKind, relative_to
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import GLTF, USD, Format
 
@@ -27,7 +27,8 @@ class Gltf(ExportKind):
     """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
 
     output: Annotated[Positional[Path | None], place("FOLDER")] = None
-    """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
+    """New folder for 0000.glb, ..., or FILE.glb for one frame; by default gltf beside the stream.
+    """
     frames: Annotated[str | None, FRAMES] = None
 
     formats = GLTF
@@ -52,7 +53,8 @@ class Usd(ExportKind):
     """
 
     output: Annotated[Positional[Path | None], place("FILE")] = None
-    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
+    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default stream.usdc
+    beside the stream."""
     frames: Annotated[str | None, FRAMES] = None
     half: Flag = False
     """Half precision of all attributes but the positions."""
@@ -65,4 +67,4 @@ class Usd(ExportKind):
 
         frames = select_frames(stream, self.frames)
         write_usd(stream, output, frames, self.half, partial(report, "Writing"))
-        return f"{len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB"
+        return f"{quantity(len(frames), 'frame')}, {output.stat().st_size / 1e6:.2f} MB"

@@ -15,6 +15,7 @@ from morgs_mi.cli.settings import (
 )
 from morgs_mi.cli.streams import DropInvalid
 from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.core.checks import quantity
 from morgs_mi.playback.default_rig import Axes
 
 
@@ -66,9 +67,9 @@ class Import:
                 lambda done, of: report("Importing", done, of),
                 most_invalid=1.0 if self.drop_invalid else 0.0,
             )
-        sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
+        sets = quantity(result.num_keyframes, "set")
         print_result(
-            f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
+            f"{result.path}: {quantity(result.num_frames, 'frame')}, {sets} of Gaussians, "
             f"{result.num_bytes / 1e6:.2f} MB."
         )
         print_next("view", out)

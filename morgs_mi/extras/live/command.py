@@ -22,6 +22,7 @@ from morgs_mi.cli.settings import (
     options,
     setting,
 )
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.files import STREAM
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 
@@ -111,7 +112,7 @@ class _Lines:
             return
         print_warning(
             f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, "
-            f"{self._drops} frames dropped, skew {1e3 * row.skew:.0f} ms."
+            f"{quantity(self._drops, 'frame')} dropped, skew {1e3 * row.skew:.0f} ms."
         )
         self._last = time_now
         self._drops = 0

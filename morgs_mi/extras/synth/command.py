@@ -13,6 +13,7 @@ from morgs_mi.cli.settings import (
     Flag,
     options,
 )
+from morgs_mi.core.checks import quantity
 from morgs_mi.extras.synth.synth_config import SynthConfig
 
 
@@ -46,6 +47,6 @@ class Synth:
         config = self.config
         images = "PNG files and videos" if config.lossless else "videos"
         cameras = len(list((self.out / "truth").glob("cam*")))
-        size = f"{config.frames} frames of {config.width}x{config.height}"
+        size = f"{quantity(config.frames, 'frame')} of {config.width}x{config.height}"
         print_result(f"{self.out}: {cameras} cameras, {size} as {images}, with ground truth.")
         print_next("fit", self.out, self.out.with_name(f"{self.out.name}-fit"))

@@ -71,7 +71,8 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
     endings = [choice.ending and f" ending in {choice.ending}" for choice in folders]
     expected = " or ".join([*names, *(f"a folder{ending}" for ending in endings)])
     raise ValueError(
-        f"{output}: the output must be {expected}, got {suffix[0] if suffix else name!r}."
+        f"{output}: the output must be {expected}, got {suffix[0] if suffix else name!r}; name "
+        "such a one, and convert it by another program, such as ffmpeg for videos."
     )
 
 

@@ -188,7 +188,7 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
         FileNotFoundError: there is no such file.
         ValueError: the file is not JSON, or a key is not as described.
     """
-    document = read_json(existing_file(file, "a camera path"))
+    document = read_json(existing_file(file, "a camera path (orbit, between or a JSON file)"))
     place = file
     try:
         views = []

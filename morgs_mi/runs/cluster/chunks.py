@@ -24,6 +24,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import TruncatedStreamError, decode_packet
 from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.files import REPORT, STREAM, locked_folder
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -73,7 +74,8 @@ def noting_chunks(out: Path) -> Iterator[None]:
         with suppress(OSError, ValueError):
             count = sum(len(StreamReader(path).frame_numbers()) for path in streams)
             if count:
-                error.add_note(f"{out / FOLDER} holds {count} frames; continue with `--resume`.")
+                frames = quantity(count, "frame")
+                error.add_note(f"{out / FOLDER} holds {frames}; continue with `--resume`.")
         raise
 
 

@@ -216,7 +216,7 @@ def test_import__reads_what_export_writes(clip, tmp_path, run):
     assert run("export", "ply", first, tmp_path / "compressed-ply")[0] == 0
     status, output, _ = run("import", tmp_path / "compressed-ply", again, "--axes", "z-up")
     assert status == 0
-    assert output.startswith(f"{again}/stream.morgs: 5 frames, one set of Gaussians, ")
+    assert output.startswith(f"{again}/stream.morgs: 5 frames, 1 set of Gaussians, ")
     assert run("export", "gltf", again)[0] == 0
     assert run("render", again, tmp_path / "png", "--camera", "front")[0] == 0
 

@@ -171,11 +171,11 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
             ("ply", "--frames", "a:b"),
             "--frames must be like 12, 10:20 or 0:100:5 and select frames of",
         ),
-        (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'."),
+        (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'; name "),
         (
             ("ply", "a.glb"),
             "must be FILE.ply or FILE.compressed.ply or a folder or a folder ending in "
-            "compressed-ply, got '.glb'.",
+            "compressed-ply, got '.glb'; name ",
         ),
         (
             ("ply", "a.ply"),
@@ -183,7 +183,10 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
             "folder.",
         ),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
-        (("video", "--path", "none.json"), "expected a camera path, found none"),
+        (
+            ("video", "--path", "none.json"),
+            "(orbit, between or a JSON file), found none",
+        ),
     ],
 )
 def test_export__errors_are_one_sentence(stream, tmp_path, capsys, args, message):
