@@ -27,6 +27,7 @@ from rich.table import Table
 
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number, require
 from morgs_mi.core.config import config_or_default
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.gaussians import Gaussians
@@ -205,7 +206,7 @@ class Accuracy:
 
 def accuracy(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | Any,
     config: RenderConfig | None = None,
     tolerance: float = 1e-3,
     progress: Report | None = None,
@@ -221,7 +222,7 @@ def accuracy(
 
     Args:
         gaussians: N Gaussians; their motion is ignored, as are the delays of the camera.
-        camera: the view.
+        camera: the view, a `Camera` or a Mitsuba `perspective` sensor.
         config: values of the settings that do not vary; default is `RenderConfig()`.
         tolerance: largest error of `Accuracy.config`.
         progress: called with (stage, done, total).
@@ -234,17 +235,26 @@ def accuracy(
         >>> image = morgs_mi.rasterize(gaussians, camera, config=result.config)
 
     Raises:
-        ValueError: as `rasterize`.
+        ValueError: as `rasterize` and `Camera.from_sensor`, none of the random pixels shows a
+            Gaussian, or the tolerance is not positive.
     """
-    config = config_or_default("accuracy()", config, RenderConfig())
-    config = replace(config, background=None)
-    camera = replace(camera, delay=0, readout=0, background=None)
-    gaussians = Gaussians(**gaussians.numpy())
-    tensors = [getattr(gaussians, name) for name in ATTRIBUTES]
-    dr.enable_grad(tensors)
+    check_number("accuracy()", "tolerance", tolerance, "(0, inf)")
+    config = replace(config_or_default("accuracy()", config, RenderConfig()), background=None)
+    camera = replace(Camera.of(camera), delay=0, readout=0, background=None)
     rng = np.random.default_rng(0)
     shape = camera.height, camera.width
     mask = rng.permutation(camera.height * camera.width).reshape(shape) < _PIXELS
+    alpha = np.array(rasterize(gaussians, camera, ("alpha",), config=config).alpha)
+    require(
+        alpha[mask].any(),
+        "accuracy()",
+        f"`camera` must see Gaussians in some of {mask.sum()} random pixels",
+        "none",
+        "choose another camera, or one that is nearer",
+    )
+    gaussians = Gaussians(**gaussians.numpy())
+    tensors = [getattr(gaussians, name) for name in ATTRIBUTES]
+    dr.enable_grad(tensors)
     weights = rng.normal(size=(*shape, 3)) * mask[..., None]
     weights32 = mi.TensorXf(weights.astype(np.float32))
     # An alpha below 1e-12 changes no float32 image.

@@ -2,6 +2,7 @@
 
 import sys
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from rich.console import Console
@@ -12,7 +13,7 @@ from morgs_mi.evaluate import accuracy as module
 from morgs_mi.evaluate.accuracy import ATTRIBUTES, reference64
 from tests import reference
 from tests.scenes.cameras import make_camera
-from tests.scenes.gaussians import as_float32, make_scene, to_gaussians
+from tests.scenes.gaussians import as_float32, isotropic, make_scene, to_gaussians
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -83,3 +84,31 @@ def test_accuracy__is_shown_as_table_and_plot_or_without_matplotlib(few_settings
     html = result._repr_html_()
     assert "1/255" in html
     assert "<svg" not in html
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gaussians": "a.ply"}, r"rasterize\(\): `gaussians` must be Gaussians, got a str"),
+        ({"gaussians": isotropic(np.zeros((0, 3)), 1, 0.5, (1, 1, 1))}, "must see Gaussians in"),
+        ({"gaussians": isotropic([[0, 0, -5]], 0.1, 0.5, (1, 1, 1))}, "must see .*, got none; cho"),
+        ({"camera": None}, r"Camera\.from_sensor\(\): `sensor` must be a `perspective` sensor"),
+        ({"config": {}}, r"rasterize\(\): `config` must be a .*RenderConfig, got a dict"),
+        ({"tolerance": float("nan")}, r"`tolerance` must be a number in \(0, inf\), got nan"),
+        ({"tolerance": -1}, r"`tolerance` must be a number in \(0, inf\), got -1"),
+    ],
+)
+def test_accuracy__refuses_bad_arguments(changes, message):
+    gaussians = isotropic([[0, 0, 3]], 0.1, 0.5, (1, 1, 1))
+    arguments = {"gaussians": gaussians, "camera": make_camera(13, 9), **changes}
+    with pytest.raises(ValueError, match=message):
+        accuracy(**arguments)
+
+
+def test_accuracy__takes_a_sensor_of_mitsuba(few_settings):
+    gaussians, camera = ball(0, 300, 40, 24, 0.1, 1)
+    camera = camera.square()
+    expected = accuracy(gaussians, camera)
+    result = accuracy(gaussians, mi.load_dict(camera.sensor()))
+    for row, other in zip(result.rows, expected.rows, strict=True):
+        assert row.errors["image"] == pytest.approx(other.errors["image"], rel=0.2)
