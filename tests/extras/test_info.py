@@ -12,6 +12,7 @@ import pytest
 from morgs_mi.extras.calibration import command as info
 from morgs_mi.extras.calibration.timing import TimeOffsets
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.playback.visualise import write_png
 from tests.cli.commands import assert_refused
 from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
 
@@ -51,8 +52,16 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture
     ):
         assert re.search(row, out)
     assert "the poses of cam2 do not fit the images; not checked: cam1." in out
-    assert "cam1 not checked: no matches with any other camera: check" in out
+    assert "cam1 not checked: its first image is black, of one colour or missing: cut" in out
     assert "cam2 does not fit: its images are upside down" in out
+
+
+def test_info__names_black_first_images(capture, run):
+    for image in capture.glob("cam*/0000.png"):
+        write_png(image, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    out = run("info", capture)[1]
+    assert "too few matches to check the poses: the first images are black, " in out
+    assert f"{', '.join(NAMES)} not checked: its first image is black, of one colour or" in out
 
 
 @pytest.mark.slow
@@ -62,7 +71,7 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture, tmp_path, ru
     times = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
     status, out, _ = run("info", path, "--plot", plot)
     assert status == 0
-    assert "1 frames at 30 fps, without points (" in out
+    assert "1 frame at 30 fps, without points (" in out
     assert out.startswith("Views between the cameras will be good: 5 cameras, 7 degrees apart")
     assert "\nReprojection check: median 0.0" in out
     assert "in 15 pairs; the poses fit the images." in out

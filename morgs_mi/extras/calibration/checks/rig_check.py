@@ -47,6 +47,10 @@ _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the "
     "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
 )
+_NO_FEATURES = (
+    "its first image is black, of one colour or missing: cut such frames off the recording, or "
+    "leave the camera out (--exclude)"
+)
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,8 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
             advice = f"the poses of {wrong} do not fit the images{rest}."
         elif not count:
             advice = (
-                "too few matches to check the poses: the views have little overlap, or the scene "
-                "has little texture."
+                "too few matches to check the poses: the first images are black, the views have "
+                "little overlap, or the scene has little texture."
             )
         else:
             some = f" of {count} of {len(checks)} cameras" if not_checked else ""
@@ -245,6 +249,8 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
         advice = f"no matches with any other camera: {_NO_OVERLAP}"
     elif not advice and len(errors) < _MIN_MATCHES:
         advice = f"only {len(errors)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    if not len(pairs.shared.features[view].points):
+        advice = _NO_FEATURES
     error = _median(errors)
     fits = None if advice else error <= MAX_ERROR
     return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)

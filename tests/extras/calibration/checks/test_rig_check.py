@@ -42,6 +42,14 @@ def test_check_rig__does_not_check_a_camera_without_matches(capture, shared):
     )
 
 
+def test_check_rig__names_a_first_image_that_is_black(capture, shared):
+    features = tuple(f if v != 3 else detect(None) for v, f in enumerate(shared.features))
+    others = tuple(match for match in shared.matches if 3 not in match.views)
+    check = check_rig(capture, SharedFeatures(features, others)).cameras[3]
+    assert check.fits is None
+    assert check.advice.startswith("its first image is black, of one colour or missing: cut such")
+
+
 def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(capture, shared):
     some = tuple(match for match in shared.matches if 5 not in match.views or match.views == (4, 5))
     wrong = with_cameras(capture, lambda i, c: turned(c, 20) if i == 4 else c)
