@@ -133,8 +133,7 @@ def balance_cameras(
     for view_exposures in (as_recorded, exposures):
         gaussians = fitted(problem.start, view_exposures, steps)
         views = _corrected(withheld, view_exposures)
-        some = [view for view in views if view.mask is not None and view.mask.any()]
-        scores.append(mean_psnr(gaussians, some, problem.render))
+        scores.append(mean_psnr(gaussians, views, problem.render))
     recorded_psnr, balanced_psnr = scores
     is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
     return Balance(exposures, is_gain, recorded_psnr, balanced_psnr)

@@ -96,10 +96,11 @@ def rendered(
 
 
 def mean_psnr(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> float:
-    """Return the mean PSNR of some views in dB, of their valid pixels."""
+    """Return the mean PSNR in dB of views, of their valid pixels; NaN without a valid pixel."""
     errors = []
     for view in views:
-        image = rendered(gaussians, view.camera, render, view.white)
-        squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
-        errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
-    return float((-10 * np.log10(np.maximum(errors, 1e-10))).mean())
+        if view.mask is None or view.mask.any():
+            image = rendered(gaussians, view.camera, render, view.white)
+            squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
+            errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
+    return float((-10 * np.log10(np.maximum(errors, 1e-10))).mean()) if errors else np.nan

@@ -77,7 +77,7 @@ def copied_images(
         elif is_image and array.dtype.kind == "f":
             copies[view] = positive_light(array, place)
             most = copies[view].max()
-            if most == 255 or (most > 2 and (copies[view] == np.rint(copies[view])).all()):
+            if most == 255 or (2 < most < 2**16 and (copies[view] % 1 == 0).all()):
                 raise ValueError(
                     f"{place} must be linear light with 1 for white where it is floats, got values "
                     f"up to {most:g}, as integers have; pass uint8 in sRGB, or divide linear light "

@@ -64,6 +64,16 @@ def test_mean_psnr__does_not_count_masked_pixels():
     assert masked[0] == masked[1] > mean_psnr(ball(80), unmasked_views, RenderConfig()) + 3
 
 
+@pytest.mark.filterwarnings("error")
+def test_mean_psnr__leaves_out_views_without_valid_pixels():
+    images = bytes_of(images_of(opaque_ball()))
+    first, *others = problem(images).views
+    none = first._replace(mask=np.zeros((48, 64), bool))
+    scores = [mean_psnr(ball(80), some, RenderConfig()) for some in (others, (none, *others))]
+    assert scores[0] == scores[1]
+    assert np.isnan(mean_psnr(ball(80), [none], RenderConfig()))
+
+
 @pytest.mark.parametrize(
     ("width", "size"),
     [(160, (160, 120)), (81, (160, 120)), (80, (80, 60)), (50, (53, 40)), (10, (160, 120))],

@@ -117,17 +117,17 @@ class Refinement:
     def sentence(self) -> str:
         """The change of the cameras and its reason, in a sentence."""
         scores = (
-            f"withheld pixels have {self.refined_psnr:.2f} dB instead of "
+            f": withheld pixels have {self.refined_psnr:.2f} dB instead of "
             f"{self.calibrated_psnr:.2f} dB"
         )
+        reason = "" if np.isnan(self.calibrated_psnr) else scores
         if not self.taken:
-            return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
+            return f"The cameras stay as calibrated, refined ones are no clear gain{reason}."
         sizes = (
             f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, "
             f"{100 * self.focal:.2g} % of the focal length and {100 * self.distortion:.2g} % of "
             "the image's width by the lens"
         )
-        reason = "" if np.isnan(self.calibrated_psnr) else f": {scores}"
         return f"The cameras were refined, {sizes}{reason}."
 
     def validation(
@@ -282,7 +282,7 @@ class _Problem:
         scores = []
         for done, changes in enumerate(estimates, self.config.short_fits.rounds):
             report(done)
-            views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
+            views = _changed(self.unseen, changes)
             scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
         return scores
 
