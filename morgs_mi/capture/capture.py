@@ -358,8 +358,8 @@ def load_capture(
     if not path.is_dir():
         kind = "a file" if path.is_file() else "none"
         raise FileNotFoundError(
-            f"{path}: expected a capture folder, with a video or a folder of images for each "
-            f"camera, found {kind}; check the path."
+            f"{path}: expected a capture folder, found {kind}; name one that has a video, or a "
+            "folder of images, for each camera."
         )
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")

@@ -58,7 +58,10 @@ def test_destination__is_named_after_its_source(tmp_path):
         ),
         (("fit",), ("CAPTURE with a video or a folder of images for each camera", "got none")),
         (("fit", "clip.mp4"), ("for each camera", "OUT for the result, got clip.mp4")),
-        (("fit", "clip.mp4", "out"), ("a folder of images for each camera, found a file",)),
+        (
+            ("fit", "clip.mp4", "out"),
+            ("found a file; name one that has a video, or a folder of images",),
+        ),
     ],
 )
 def test_commands__name_what_was_expected_in_a_first_mistake(
