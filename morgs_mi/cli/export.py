@@ -62,10 +62,12 @@ class Ply(ExportKind):
 
 @options
 class Flight(ExportKind):
-    """Render a stream along a moving camera into an mp4."""
+    """Render a stream along a moving camera into a video."""
 
     output: Annotated[Positional[Path | None], place("FILE.mp4")] = None
-    """File for the video; by default PATH.mp4, such as between.mp4, beside the stream."""
+    """File for the video, FILE.mp4 (H.264) or FILE.webm (VP9); by default PATH.mp4, such as
+    between.mp4, beside the stream.
+    """
     path: Annotated[str, arg(metavar="PATH")] = "between"
     """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file
     (docs/exports.md).

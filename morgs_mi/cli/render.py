@@ -35,10 +35,11 @@ class Render:
         Positional[Path | None],
         arg(metavar="[FILE_OR_FOLDER]"),
     ] = None
-    """FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for
-    multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels,
-    confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default CAMERA.mp4 or PATH.mp4,
-    such as orbit.mp4, beside the stream; of a file of Gaussians, FILE-orbit.mp4 beside it.
+    """FILE.mp4 (H.264) or FILE.webm (VP9); a new folder whose name ends in png, for PNG files;
+    another new folder, for multichannel EXR files (R, G, B in linear light, motion.X and motion.Y
+    in pixels, confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default CAMERA.mp4 or
+    PATH.mp4, such as orbit.mp4, beside the stream; of a file of Gaussians, FILE-orbit.mp4 beside
+    it.
     """
     camera: Annotated[str | None, optional("CAMERA")] = None
     """Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A

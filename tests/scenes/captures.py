@@ -55,7 +55,14 @@ def videos(path, names, suffix=".mkv"):
 
 
 def write_timed_video(
-    path, images, times, codec="ffv1", layout="rgb24", edit=lambda stream: None, time_code=""
+    path,
+    images,
+    times,
+    codec="ffv1",
+    layout="rgb24",
+    options=None,
+    edit=lambda stream: None,
+    time_code="",
 ):
     """Write a video that shows its frames at `times`, in ascending milliseconds from 0.
 
@@ -65,6 +72,7 @@ def write_timed_video(
         times: of the frames.
         codec: FFmpeg's name of it; only `ffv1` is lossless.
         layout: FFmpeg's name of the pixels' layout in `images`.
+        options: of the encoder.
         edit: changes the stream before it is written.
         time_code: of the first frame.
     """
@@ -72,7 +80,7 @@ def write_timed_video(
         if time_code:
             container.metadata["timecode"] = time_code
         period = int(np.gcd.reduce(times)) or 40
-        stream = container.add_stream(codec, rate=Fraction(1000, period))
+        stream = container.add_stream(codec, rate=Fraction(1000, period), options=options)
         stream.height, stream.width = images[0].shape[:2]
         stored = {"ffv1": "bgr0" if layout == "rgb24" else layout, "mjpeg": "yuvj420p"}
         stream.pix_fmt = stored.get(codec, "yuv420p")

@@ -7,8 +7,8 @@ PER_SECOND = 1000
 
 
 def show_parts(path, parts):
-    """Let an .mp4 or .mov of OpenCV show only parts of itself in succession, given by their starts
-    and lengths, s.
+    """Let an .mp4 or .mov of `write_timed_video` show only parts of itself in succession, given by
+    their starts and lengths, s.
 
     A part with a negative start is a pause.
     """

@@ -26,7 +26,7 @@ from morgs_mi.evaluate.results import ViewScores
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import stored_settings, synthesize
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.io.video_writer import H264, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
 from morgs_mi.playback.player import explained_image, render_stream
@@ -184,7 +184,7 @@ def _draw(out: Path, capture: Capture, report: Steps) -> None:
     names = ("truth", "render", "motion", "confidence")
     rows = [side_by_side([panels[name] for name in names if name in panels]) for panels in full]
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
-    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
+    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, H264)
     report(1, 2)
     # The contact sheet has three frames of the one fit, and one of the other, which does not learn
     # the confidence.

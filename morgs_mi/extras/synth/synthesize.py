@@ -43,7 +43,7 @@ from morgs_mi.extras.synth.scene import Scene, check_scene, load_scene
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.io.listing import is_added
 from morgs_mi.io.video import open_frames
-from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.io.video_writer import H264, write_video
 
 _LOG = logging.getLogger(__name__)
 # Bytes of a pixel of an image with its ground truth.
@@ -238,10 +238,10 @@ def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | 
         if config.lossless:
             png = folder / "frames" / camera.name
             write_video(png, images(index, camera), config.fps)
-            write_video(video, open_frames(png).frames(), config.fps, PLAYABLE)
+            write_video(video, open_frames(png).frames(), config.fps, H264)
             clips.append(png)
         else:
-            write_video(video, images(index, camera), config.fps, PLAYABLE)
+            write_video(video, images(index, camera), config.fps, H264)
             clips.append(video)
     return clips
 

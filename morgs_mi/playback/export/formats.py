@@ -41,7 +41,7 @@ PLY = (
 )
 GLTF = (Format("glb", "gltf", folder=True),)
 USD = tuple(Format(name, f"stream.{name}") for name in ("usdc", "usd", "usda", "usdz"))
-VIDEO = (Format("mp4", "{}.mp4"),)
+VIDEO = (Format("mp4", "{}.mp4"), Format("webm", "{}.webm"))
 WEB = (Format("html", "player.html"), Format("", "web", folder=True))
 IMAGES = (
     *VIDEO,

@@ -12,12 +12,14 @@ from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.exr import write_exr
-from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.io.video_writer import H264, VP9, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import explained_image
 from morgs_mi.playback.visualise import side_by_side, to_uint8, write_png
 from morgs_mi.render.channels import exr_names
 
+# Of the videos, by format.
+_ENCODERS = {"mp4": H264, "webm": VP9}
 # Index and channels [H, W, C] by name.
 _Frame = tuple[int, Arrays]
 
@@ -35,9 +37,10 @@ def write_images(
     Args:
         rendered: the frames, as `render_stream` yields them.
         fps: frames per second.
-        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png``
-            for the same images as ``0000.png`` ..., any other folder for multichannel ``0000.exr``
-            ... (see `exr_channels`), or ``FILE.png`` or ``FILE.exr`` for a single frame.
+        output: ``FILE.mp4`` (H.264) or ``FILE.webm`` (VP9) for a video of the channels side by
+            side, a folder ending in ``png`` for the same images as ``0000.png`` ..., any other
+            folder for multichannel ``0000.exr`` ... (see `exr_channels`), or ``FILE.png`` or
+            ``FILE.exr`` for a single frame.
         progress: called with the number of frames done.
         display_exposure: stops by which videos and PNG files are brightened before they are
             clipped at white.
@@ -62,9 +65,9 @@ def write_images(
                 progress(count)
 
     frames = display_frames()
-    if kind == "mp4":
+    if kind in _ENCODERS:
         movie = (pad_to_even(_combined_image(images)) for _, images in frames)
-        write_video(output, movie, fps, PLAYABLE)
+        write_video(output, movie, fps, _ENCODERS[kind])
         return
     is_file = choice.is_file(output)
     with (atomic_path if is_file else atomic_folder)(output, "write_images()") as partial:
