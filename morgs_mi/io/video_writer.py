@@ -26,6 +26,7 @@ _OPTIONS = {
     H264: {"crf": "20"},
     VP9: {"crf": "24", "b": "0", "cpu-used": "4", "row-mt": "1"},
 }
+_LONGEST_SIDE = 16384  # px, of libx264
 _BT709 = 1  # FFmpeg's number of it, as a matrix, primaries and a transfer function
 _LIMITED = 1  # of the range 16 to 235
 
@@ -46,7 +47,8 @@ def write_video(
         codec: FFmpeg's name of an encoder: `FFV1`, `H264`, `VP9`, or another one of 4:2:0 chroma.
 
     Raises:
-        ValueError: there are no frames, a frame is not as described, or PyAV lacks the encoder.
+        ValueError: there are no frames, a frame is not as described or too large for H.264, or PyAV
+            lacks the encoder.
         OSError: the folder exists, or a file cannot be written.
     """
     path = Path(path)
@@ -68,13 +70,22 @@ def write_video(
     )
     with atomic_path(path, "write_video()", parents=True) as partial:
         first = next(frames)
+        height, width = first.shape[:2]
+        require(
+            codec != H264 or max(height, width) <= _LONGEST_SIDE,
+            f"write_video({path})",
+            f"expected at most {_LONGEST_SIDE} pixels across and down in H.264",
+            f"{width}x{height}",
+            "write smaller images, fewer channels or FILE.webm",
+        )
         # Web pages play an .mp4 while it is loaded. A colon in the path would name a protocol.
         flags = {"movflags": "+faststart"}
         with av.open(f"file:{partial}", "w", container_options=flags) as container:
             rate = Fraction(fps).limit_denominator(1001)  # e.g. 24000/1001
             options = _OPTIONS.get(codec, {})
             stream = cast(av.VideoStream, container.add_stream(codec, rate, options=options))
-            stream.height, stream.width = first.shape[:2]
+            stream.height = height
+            stream.width = width
             stream.pix_fmt = "bgr0"
             if codec != FFV1:
                 stream.pix_fmt = "yuv420p"
