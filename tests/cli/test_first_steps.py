@@ -54,7 +54,7 @@ def test_destination__is_named_after_its_source(tmp_path):
         (("view", "clip"), ("if clip is a capture, fit it first: morgs-mi fit clip OUT",)),
         (
             ("render", "a.ply", "a.gif"),
-            ("FILE.mp4 or FILE.exr or FILE.png", "got '.gif'; name"),
+            ("FILE.mp4 or FILE.webm or", "got '.gif'; name"),
         ),
         (("fit",), ("CAPTURE with a video or a folder of images for each camera", "got none")),
         (("fit", "clip.mp4"), ("for each camera", "OUT for the result, got clip.mp4")),
