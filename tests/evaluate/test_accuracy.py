@@ -93,7 +93,7 @@ def test_accuracy__is_shown_as_table_and_plot_or_without_matplotlib(few_settings
         ({"gaussians": isotropic(np.zeros((0, 3)), 1, 0.5, (1, 1, 1))}, "must see Gaussians in"),
         ({"gaussians": isotropic([[0, 0, -5]], 0.1, 0.5, (1, 1, 1))}, "must see .*, got none; cho"),
         ({"camera": None}, r"Camera\.from_sensor\(\): `sensor` must be a `perspective` sensor"),
-        ({"config": {}}, r"rasterize\(\): `config` must be a .*RenderConfig, got a dict"),
+        ({"config": {}}, r"accuracy\(\): `config` must be a .*RenderConfig, got a dict"),
         ({"tolerance": float("nan")}, r"`tolerance` must be a number in \(0, inf\), got nan"),
         ({"tolerance": -1}, r"`tolerance` must be a number in \(0, inf\), got -1"),
     ],
