@@ -175,7 +175,7 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         if name is None:
             data = read_bytes(path)
         else:
-            with zipfile.ZipFile(regular(path)) as archive:
+            with zipfile.ZipFile(BytesIO(read_bytes(path))) as archive:
                 size = archive.getinfo(f"{name}.npy").file_size
                 check_claim(path, size, f"{size} bytes of {name}.npy")
                 data = archive.read(f"{name}.npy")
@@ -203,7 +203,7 @@ def array_names(path: str | Path) -> list[str]:
     """
     with (
         _refusing(path, "a NumPy archive", "export it again"),
-        zipfile.ZipFile(regular(path)) as archive,
+        zipfile.ZipFile(BytesIO(read_bytes(path))) as archive,
     ):
         return [name.removesuffix(".npy") for name in archive.namelist()]
 

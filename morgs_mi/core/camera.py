@@ -84,7 +84,7 @@ class Camera:
             check_number(where, name, getattr(self, name), "[-1, 1]")
         K = numbers(where, "K", self.K, 3, 3).astype(np.float64)
         require(
-            bounded(K) and K[0, 0] > 0 and K[1, 1] > 0,
+            bounded(K) and min(K[0, 0], K[1, 1]) * LARGEST >= 1,  # so are their reciprocals
             where,
             "`K` must be finite with positive focal lengths",
             K.tolist(),

@@ -54,6 +54,12 @@ def npz(member, name="data.npy"):
     return write
 
 
+def npz_of_a_large_directory(path):
+    npz(npy("(6,)"))(path)
+    data = path.read_bytes()
+    path.write_bytes(data[:-10] + b"\xff\xff\xff\x7f" + data[-6:])
+
+
 def ply(header, body=b""):
     return b"ply\n" + header.encode() + b"end_header\n" + body
 
@@ -106,6 +112,7 @@ CASES = {
         npz(npy("(6,)"), "a.npy"),
         "expected an array `data` in a NumPy archive",
     ),
+    "npz of a large directory": (archived, npz_of_a_large_directory, "got a broken file"),
     "deep JSON": (read_json, b"[" * 100_000, "expected JSON, got a broken file"),
     "JSON of empty lists": (
         read_json,

@@ -113,6 +113,7 @@ def test_camera__copies_its_matrices():
         ({"K": np.eye(2)}, r"`K` must be an array of real numbers \[3, 3\]"),
         ({"K": K + np.eye(3, k=1)}, "a camera without skew"),
         ({"K": -K}, "positive focal lengths"),
+        ({"K": K * [[1e-30, 1, 1], [1, 1, 1], [1, 1, 1]]}, "positive focal lengths"),
         ({"viewmat": VIEWMAT * np.nan}, r"Camera\(\), `viewmat`: the pose must be finite"),
         (
             {"viewmat": np.diag([1, 1, 1, 1e308])},
