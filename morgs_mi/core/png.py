@@ -12,6 +12,9 @@ import numpy as np
 # The signature, and length and name of the first chunk, which begins with width and height.
 _START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 _SIZE = struct.Struct(">II")
+_CHUNKS = 8  # where they begin
+_CHUNK = struct.Struct(">I4s")  # length and name, which its content and a checksum follow
+_CRC = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +37,25 @@ class PngImage:
             ValueError: the file is broken.
         """
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(self.data, np.uint8), flags)
+        image = None
+        if has_whole_chunks(self.data):
+            image = cv2.imdecode(np.frombuffer(self.data, np.uint8), flags)
         if image is None:
             raise ValueError("expected a PNG image, got a broken file; write it again.")
         return image
+
+
+def has_whole_chunks(data: bytes) -> bool:
+    """Return whether the chunks of a PNG file, up to its last one, lie within it.
+
+    OpenCV allocates, and writes, what the length of a chunk claims, up to 4 GB.
+    """
+    at = _CHUNKS
+    name = b""
+    while name != b"IEND" and at + _CHUNK.size <= len(data):
+        length, name = _CHUNK.unpack_from(data, at)
+        at += _CHUNK.size + length + _CRC
+    return name == b"IEND" and at <= len(data)
 
 
 def png_bytes(image: np.ndarray) -> bytes:

@@ -410,6 +410,7 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
         for row in document["frames"][: len(frames)]:
             values = {
                 "seconds": float(row["seconds"]),
+                "status": "" + row["status"],  # a TypeError unless it is a string
                 "missing_views": tuple(row["missing_views"]),
                 "fingerprints": tuple(row.get("fingerprints", ())),
                 "exposures": tuple(

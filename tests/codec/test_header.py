@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import resource
 import struct
 import zlib
 from dataclasses import replace
@@ -14,7 +15,7 @@ from numpy.testing import assert_array_equal
 from morgs_mi.codec.container import StreamWriter, header_fields, header_json, load_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.png import jpeg_bytes, png_bytes
+from morgs_mi.core.png import PngImage, jpeg_bytes, png_bytes
 from morgs_mi.render.rasterize import rasterize
 from tests.scenes.coded_clip import CAMERAS, cloud
 
@@ -135,6 +136,18 @@ def test_header__images_are_decoded_where_they_are_drawn():
     (view, _), _, _ = header_fields(with_entry("cameras.0.background", f'"{broken}"'))
     with pytest.raises(ValueError, match=r"`background`: expected a PNG image, got a broken file"):
         rasterize(cloud(), view)
+
+
+@pytest.mark.parametrize("length", [0x0FFFFFFF, 0xFFFFFFFF])
+@pytest.mark.parametrize("name", [b"IDAT", b"tEXt"])
+def test_png_image__takes_no_memory_for_chunks_that_are_not_there(length, name):
+    file = png_bytes(FITTING)
+    image = PngImage(file[:33] + struct.pack(">I", length) + name + file[33:])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match="expected a PNG image, got a broken file"):
+        image.pixels  # noqa: B018 (it decodes)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000, "kB"
+    assert_array_equal(PngImage(file + b"more").pixels, FITTING)
 
 
 def test_header__images_are_not_rotated():

@@ -300,10 +300,10 @@ def fit_arms(
         path = folder / "scores.json"
         metadata = stream_metadata(capture, frame, config)
         made = json.loads(json.dumps([metadata, start]))
-        if not path.exists() or read_json(path)["made"] != made:
+        if not path.exists() or stored_scores(path)[0] != made:
             compile_kernels(replace(apply_values(config, _WARM), seed=0))
             write_json(path, {"made": made, "scores": fit(folder, config, metadata)})
-        return read_json(path)["scores"]
+        return stored_scores(path)[1]
 
     def fit_first(folder: Path, config: StreamConfig, _: Any) -> list[list[float]]:
         shown = []
@@ -344,6 +344,28 @@ def fit_arms(
     return SweepResult(
         capture.path.name, bool(capture.test_views), names, epochs, scores, first_frames
     )
+
+
+def stored_scores(path: Path) -> tuple[Any, list[Any]]:
+    """Return what a fit was made of, and its scores: a number for each of `TITLES`, or the pairs of
+    `SweepResult.first_frames`.
+
+    Raises:
+        ValueError: the file has something else.
+    """
+    try:
+        document = read_json(path)
+        made = document["made"]
+        scores = document["scores"]
+        rows = np.array(scores, float)  # None is NaN
+        if rows.shape not in ((len(TITLES),), (len(scores), 2)):
+            raise ValueError(f"numbers {list(rows.shape)}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path}: expected the scores of a fit, got a broken file ({error!r}); remove it, and "
+            "the fit is made again."
+        ) from None
+    return made, scores
 
 
 def _fit_later(

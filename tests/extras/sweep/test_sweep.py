@@ -2,6 +2,7 @@
 there are not made again. Parts are left out alone and together.
 """
 
+import json
 import tomllib
 from dataclasses import replace
 
@@ -14,7 +15,14 @@ from morgs_mi.core.bounded import read_json
 from morgs_mi.core.config import apply_values, config_toml, read_config
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.extras.sweep import sweep as module
-from morgs_mi.extras.sweep.sweep import PARTS, TITLES, SweepResult, leave_out, sweep
+from morgs_mi.extras.sweep.sweep import (
+    PARTS,
+    TITLES,
+    SweepResult,
+    leave_out,
+    stored_scores,
+    sweep,
+)
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
@@ -27,6 +35,32 @@ __all__ = ["run"]
 
 # Provisional first frames come from its rounds of density control.
 QUICK = quick(density=DensityConfig(rounds=2, later_frames=False))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "5",
+        "[]",
+        "null",
+        '{"made": []}',
+        '{"made": [], "scores": 5}',
+        '{"made": [], "scores": [1, 2]}',
+        '{"made": [], "scores": [[1], [2, 3]]}',
+        '{"made": [], "scores": [[1, "x"]]}',
+    ],
+)
+def test_stored_scores__refuse_what_no_sweep_has_written(tmp_path, text):
+    (tmp_path / "scores.json").write_text(text)
+    with pytest.raises(ValueError, match=r"scores\.json: expected the scores of a fit, got a bro"):
+        stored_scores(tmp_path / "scores.json")
+
+
+def test_stored_scores__have_none_where_a_score_is_unknown(tmp_path):
+    for scores in ([1.0, 2.0, None, 4, 5, 6], [[1.0, None], [2, 3]]):
+        (tmp_path / "scores.json").write_text(json.dumps({"made": [{}, None], "scores": scores}))
+        assert stored_scores(tmp_path / "scores.json") == ([{}, None], scores)
 
 
 @pytest.mark.slow

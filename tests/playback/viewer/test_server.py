@@ -236,6 +236,20 @@ def test_viewer__serves_regular_files_of_its_folder_alone(tmp_path, name, secret
         assert (response.status, content) == (200, (folder / "stream.morgs").read_bytes())
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links")
+def test_viewer__names_a_stream_that_has_become_a_link_to_itself(tmp_path):
+    path = tmp_path / "stream.morgs"
+    write_stream(path)
+    with viewing(path) as url:
+        path.unlink()
+        path.symlink_to(path)
+        assert get(url)[0].status == 200
+        for part in ("stream.morgs", exact(0, "color", rig()[0]), "recorded/0/0"):
+            response, content = get(url, part)
+            assert response.status == 400
+            assert b"expected a file, got a link" in content
+
+
 @pytest.mark.parametrize("name", ["a\nb", "\udcff"])
 def test_viewer__serves_streams_of_any_name(tmp_path, name):
     path = tmp_path / f"{name}.morgs"
