@@ -163,7 +163,7 @@ COLMAP = {
 NERFSTUDIO = {
     "no frames": (
         transforms(lambda m: m.update(frames=[])),
-        "transforms.json: `frames` must be a list of objects, got \\[\\]",
+        "transforms.json: `frames` must have an entry for each camera, got none; export it again",
     ),
     "unnamed": (
         transforms(lambda m: m["frames"][1].pop("file_path")),
@@ -171,19 +171,47 @@ NERFSTUDIO = {
     ),
     "no size": (
         transforms(lambda m: m.update(w="62")),
-        "frame 0 .*: `w` must be a finite number .*, here or .* got '62'",
+        r"frame 0 .*: `w` must be a number in \[-1e12, 1e12\], got '62'",
     ),
     "unknown model": (
         transforms(lambda m: m.update(camera_model="EQUIRECTANGULAR")),
         "got 'EQUIRECTANGULAR' with 0; undist",
     ),
-    "flag": (
-        transforms(lambda m: m.update(is_fisheye="yes")),
-        "frame 0 .*: `is_fisheye` must be true or false, got 'yes'",
+    "list": (
+        lambda path: (path / "transforms.json").write_text("[]"),
+        r"transforms.json: expected an object, got \[\]",
+    ),
+    "list of texts": (
+        transforms(lambda m: m["frames"].append("cam3")),
+        "transforms.json: `frames` must be a list of objects, got .*; export it again",
+    ),
+    "neither size nor image": (
+        lambda path: edit(
+            path,
+            lambda m: [m.pop("w"), *(f.update(file_path="a.png") for f in m["frames"])],
+        ),
+        "expected `w` and `h`, or an image of their size, found none; copy the images",
+    ),
+    "angle": (
+        transforms(lambda m: [m.update(camera_angle_x=0), *(f.pop("fl_x") for f in m["frames"])]),
+        r"frame 0 .*: `camera_angle_x` must be a number in \(0, 3.14159\), got 0",
+    ),
+    "split without frame": (
+        transforms(lambda m: m.update(test_filenames=["cam2.png", "gone.png"])),
+        "the splits must name images by their `file_path`, got cam2.png, gone.png; correct",
+    ),
+    "split is a number": (
+        transforms(lambda m: m.update(test_filenames=3)),
+        "transforms.json: `test_filenames` must be a list, got 3; export it again",
+    ),
+    "moving camera": (
+        transforms(lambda m: [f.update(time=i / 2) for i, f in enumerate(m["frames"])]),
+        "`time` must have as many values as each camera has images, 1, because cameras are fixed, "
+        "got 3; record by fixed cameras",
     ),
     "long number": (
         transforms(lambda m: m.update(k1=10**400)),
-        "`k1` must be a finite number .* got 1000",
+        "`k1` must be a number in .* got 1000",
     ),
     "large size": (
         transforms(lambda m: m.update(w=1e11, h=1e10)),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
@@ -25,10 +25,10 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import few
+from morgs_mi.core.checks import few, require
 from morgs_mi.core.rig import far_origin, moved, scene_extent
-from morgs_mi.io.listing import VIDEO_SUFFIXES, images_in, listed
-from morgs_mi.io.numbering import natural_key
+from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
+from morgs_mi.io.numbering import frame_numbers, natural_key
 from morgs_mi.io.video import Clip
 
 _LOG = logging.getLogger(__name__)
@@ -56,6 +56,8 @@ class Calibration:
     masks: tuple[tuple[Path, ...], ...] = ()
     #: Point of the file's world that cameras and points are relative to.
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    #: Names of clips without a camera, and of cameras without a clip, which are left out.
+    unused: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,9 +97,10 @@ class Calibration:
         messages.
 
         Raises:
-            ValueError: there is no such camera, or none is left.
+            ValueError: there is no such camera or clip, or no camera is left.
         """
-        indices = [self.names.index(name) for name in names_without(path, self.names, names)]
+        rest = names_without(path, self.names, sorted({*names} - {*self.unused}))
+        indices = list(map(self.names.index, rest))
         views = self.test_views
         return replace(
             self,
@@ -191,7 +194,8 @@ def match_clips(
     """Return the fixed cameras that have a clip, in numerical order of the clips' names, and the
     indices of each one's images among `cameras`.
 
-    Cameras without a clip, and clips without a camera, are left out with a warning.
+    Cameras without a clip, and clips without a camera, are left out with a warning. Photos of equal
+    pose and lens are the frames of one camera, which has the name of the first.
 
     Args:
         path: the capture folder; its photos, its frame folders, and clips or photos in folders of
@@ -203,17 +207,14 @@ def match_clips(
 
     Raises:
         FileNotFoundError: no camera has a clip.
-        ValueError: two images of one clip have different poses or lenses, or a frame folder is
-            missing.
+        ValueError: two images of one clip have different poses or lenses, a frame folder is
+            missing, or the photos of several cameras have other numbers.
     """
     # Tolerances of poses are relative to their coordinates.
     local = moved(cameras, far_origin(cameras))
-    parts = [PurePosixPath(camera.name.replace("\\", "/")).parts[:-1] for camera in cameras]
-    folders = map(clips.get, {folder for place in parts for folder in place})
-    in_folders = any(isinstance(clip, Path) and clip.is_dir() for clip in folders)
     attempts = (
         (lambda _: clips, True),
-        (lambda _: {} if in_folders else clips, False),
+        # Beside folders that could be clips, such as `depth`.
         (photos, False),
         (clips_by_frame, False),
         (clips_by_rig, True),
@@ -245,7 +246,14 @@ def match_clips(
     if match.without:
         _LOG.warning("%s: no clip is named after %s: left out.", source, few(match.without))
     if extras := [name for name in clips if name not in match.images]:
-        _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(extras))
+        _LOG.warning("%s does not calibrate %s: not used.", source, few(extras))
+    unused = (*extras, *match.without)
+    poses = [
+        (camera.world_to_camera.tobytes(), camera.K.tobytes(), camera.size, lens)
+        for camera, lens in zip(cameras, lenses, strict=True)
+    ]
+    masks = _masks(path, match.images)
+    match = _frames_of_cameras(source, match, poses)
     names = sorted(match.images, key=natural_key)
     images = tuple(tuple(match.images[name]) for name in names)
     calibration = Calibration(
@@ -253,33 +261,28 @@ def match_clips(
             replace(cameras[index[0]], name=name) for name, index in zip(names, images, strict=True)
         ),
         tuple(lenses[index[0]] for index in images),
-        tuple(clips[name] for name in names),
-        masks=tuple(
-            _masks(path, name, clips[name], [cameras[i].name for i in index])
-            for name, index in zip(names, images, strict=True)
-        ),
+        tuple(match.clips[name] for name in names),
+        masks=tuple(masks.get(name, ()) for name in names),
+        unused=unused,
     )
-    if (path / "masks").is_dir() and not any(calibration.masks):
-        _LOG.warning("%s: no mask is named after an image, such as %s.png.png.", path, names[0])
     return calibration, images
 
 
-def _masks(path: Path, camera: str, clip: Clip, images: Sequence[str]) -> tuple[Path, ...]:
-    """Return the masks of a clip as COLMAP names them, ``masks/IMAGE.png``, of its first, middle
-    and last file and of those `images` of the calibration.
+def _masks(path: Path, cameras: Collection[str]) -> dict[str | None, tuple[Path, ...]]:
+    """Return the first mask of each camera in the folder ``masks`` of a capture. It has the name of
+    an image with ``.png`` added, as COLMAP names it, or in place of the suffix.
     """
-    files = images_in(clip) if isinstance(clip, Path) and clip.is_dir() else clip
-    places = [file.relative_to(path) for file in ([files] if isinstance(files, Path) else files)]
-    inner = [Path(*place.parts[1:]) for place in places]
-    inner = [place for place in inner if view_of_image([camera], str(place))]
-    names = [
-        path / "masks" / group[i]
-        for group in (images, places, inner, [camera])
-        for i in (0, len(group) // 2, -1)
-        if group
-    ]
-    masks = [mask for name in names for mask in (Path(f"{name}.png"), name.with_suffix(".png"))]
-    return tuple(dict.fromkeys(filter(Path.is_file, masks)))
+    masks: dict[str | None, tuple[Path, ...]] = {}
+    for file in sorted((path / "masks").rglob("[!.]*.png")):
+        image = file.relative_to(path / "masks").with_suffix("")
+        masks.setdefault(view_of_image(cameras, str(image), by_folder=True), (file,))
+    if None in masks:
+        _LOG.warning(
+            "%s: not used, because no camera's image has its name, such as %s.png.png.",
+            *masks[None],
+            next(iter(cameras)),
+        )
+    return masks
 
 
 @dataclass(frozen=True)
@@ -306,7 +309,10 @@ def _matched(
     """
     match = _NamedMatch(clips, {}, [])
     for index, camera in enumerate(cameras):
-        name = clip_of_camera(clips, camera.name) or view_of_image(clips, camera.name, by_folder)
+        name = camera.name
+        if name not in clips:
+            # The search for a word takes far longer than the one for names.
+            name = view_of_image(clips, name, by_folder) or clip_of_camera(clips, name)
         if name is None:
             match.without.append(camera.name)
             continue
@@ -323,3 +329,35 @@ def _matched(
                 "of each fixed camera, and name the clips after them."
             )
     return match
+
+
+def _frames_of_cameras(source: Path, match: _NamedMatch, poses: Sequence[Hashable]) -> _NamedMatch:
+    """Return the match with one clip, named after the first, for all photos of equal pose and lens.
+
+    Raises:
+        ValueError: some have several photos, and the numbers of theirs differ or have gaps.
+    """
+    frames: dict[Hashable, dict[str, Path]] = {}
+    for name in sorted(match.images, key=natural_key):
+        clip = match.clips[name]
+        if isinstance(clip, Path) or len(clip) != 1:
+            return match
+        frames.setdefault(poses[match.images[name][0]], {})[name] = clip[0]
+    if len(frames) == len(match.images):
+        return match
+    groups = [list(files) for files in frames.values()]
+    numbers = {tuple(frame_numbers(source, names)) for names in groups}
+    steps = np.diff(min(numbers))
+    require(
+        len(numbers) == 1 and (steps == np.abs(steps[:1])).all(),
+        source,
+        "images of equal pose and lens are frames of one camera, and all cameras must have images "
+        "of the same numbers without gaps",
+        few([f"{names[0]} to {names[-1]}" for names in groups], 4),
+        f"leave out images that repeat a pose, or make {EXAMPLE}",
+    )
+    return _NamedMatch(
+        {next(iter(files)): tuple(files.values()) for files in frames.values()},
+        {names[0]: [match.images[name][0] for name in names] for names in groups},
+        [],
+    )

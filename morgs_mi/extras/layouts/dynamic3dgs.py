@@ -109,7 +109,15 @@ def _read_calibration(path: Path) -> Calibration:
     points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
     cameras, clips = zip(*(rig[name] for name in names), strict=True)
     test_views = tuple(index for index, name in enumerate(names) if name in test)
-    return Calibration(cameras, (Lens(),) * len(names), clips, points, colors, test_views or None)
+    return Calibration(
+        cameras,
+        (Lens(),) * len(names),
+        clips,
+        points,
+        colors,
+        test_views or None,
+        unused=tuple(empty),
+    )
 
 
 READER = Reader(

@@ -476,6 +476,52 @@ def test_match_clips__reads_folders_of_folders(tmp_path, files, names):
     assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
+@pytest.mark.parametrize("count", [COUNT, 1])
+def test_match_clips__of_photos_with_equal_poses_reads_frames(tmp_path, count):
+    """One photo of each camera is a static scene."""
+    cameras = rig(("a", "b"), shift=3)
+    for i, t in np.ndindex(len(cameras), count):
+        layouts.write_image(tmp_path / f"images/{'ab'[i]}{t:03}.png", i, t)
+    views = [replace(c, name=f"{c.name}{t:03}.png") for t in range(count) for c in cameras]
+    write_colmap(tmp_path / "sparse/0", views)
+    capture = load_capture(tmp_path)
+    assert (capture.names, capture.num_frames) == (("a000", "b000"), count)
+    for t, frame in enumerate(capture.frames()):
+        assert [tuple(image[20, 30, :2]) for image in frame.images] == [(0, t), (1, t)]
+    assert "static scene" not in "".join(capture.notes) or count == 1
+
+
+def test_match_clips__leaves_videos_with_equal_poses_apart(tmp_path):
+    """`info` reports them as a mistake in the calibration."""
+    names = ("cam1", "cam2")
+    layouts.videos(tmp_path, names)
+    (camera,) = rig(("cam1",))
+    write_colmap(tmp_path / "sparse/0", [replace(camera, name=name) for name in names])
+    assert load_capture(tmp_path).names == names
+
+
+@pytest.mark.parametrize(
+    ("build", "clip", "without"),
+    [(layouts.colmap, "cam3.mkv", "cam3"), (layouts.dynamic3dgs, "", "2")],
+)
+def test_without__takes_names_of_clips_and_cameras_that_are_left_out(
+    tmp_path, build, clip, without
+):
+    path = build(tmp_path / "a")
+    if clip:
+        shutil.copy(path / "cam1.mkv", path / clip)
+    else:
+        shutil.rmtree(path / "ims" / without)
+    names = load_capture(path).names
+    assert load_capture(path, reading=ReadConfig(without=(without,))).names == names
+    rest = load_capture(path, reading=ReadConfig(without=(without, names[0]))).names
+    assert rest == names[1:]
+    with pytest.raises(ValueError, match=r"must name cameras of .*, got gone"):
+        load_capture(path, reading=ReadConfig(without=(without, "gone")))
+    with pytest.raises(ValueError, match="`without` must leave at least one camera, got all"):
+        load_capture(path, reading=ReadConfig(without=(without, *names)))
+
+
 def test_anipose__reads_the_names_of_pose2sim(tmp_path):
     path = layouts.anipose(
         tmp_path / "a", clips=lambda path, _: layouts.videos(path, ("A", "B", "C"))
@@ -523,6 +569,23 @@ def test_colmap__uses_its_masks(tmp_path, mask):
     capture = load_capture(path)
     assert capture.masks[::2] == (None, None)
     assert_array_equal(capture.masks[1], left > 0)
+
+
+def test_masks__are_the_first_of_each_camera_and_others_are_named(tmp_path, caplog):
+    path = layouts.colmap(tmp_path / "a")
+    whole = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    for name, columns in (("cam2/0000.png.png", 9), ("cam2/0001.png.png", 30), ("cam7.png", 2)):
+        file = path / "masks" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), np.where(np.arange(WIDTH) < columns, 0, whole))
+    (path / "masks/cam2/._0000.png.png").write_bytes(b"added by macOS")
+    capture = load_capture(path)
+    assert capture.masks[::2] == (None, None)
+    assert capture.masks[1].sum() == HEIGHT * (WIDTH - 9)
+    assert caplog.messages == [
+        f"{path / 'masks/cam7.png'}: not used, because no camera's image has its name, such as "
+        "cam1.png.png."
+    ]
 
 
 # Easting, northing and height of a rig, m.

@@ -1,5 +1,9 @@
-"""Nerfstudio's `transforms.json`: lenses, masks, splits, sizes and keys of its exporters."""
+"""Nerfstudio's `transforms.json`: lenses, masks, splits, sizes and keys of its exporters; the two
+files of NeRF's synthetic scenes.
+"""
 
+import json
+from dataclasses import replace
 from unittest.mock import Mock
 
 import cv2
@@ -10,6 +14,7 @@ from numpy.testing import assert_array_equal
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.clips import size_of_clip
 from morgs_mi.capture.layouts.nerfstudio import READER
+from morgs_mi.core.bounded import read_json
 from morgs_mi.testing import assert_close
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
@@ -133,9 +138,13 @@ SPLITS = {
         (0, 1),
     ),
     "other than training": (
-        {"train_filenames": ["images/cam1.png"], "test_filenames": ["images/cam10.png", "cam2"]},
+        {
+            "train_filenames": ["images/cam1.png"],
+            "test_filenames": ["images\\cam10.png", "images/cam2.png"],
+        },
         (1, 2),
     ),
+    "only training": ({"train_filenames": ["images/cam10.png"]}, (0, 1)),
     "trained and tested": (
         {
             "train_filenames": [f"images/{n}.png" for n in NAMES],
@@ -155,20 +164,162 @@ def test_nerfstudio__holds_out_the_views_of_its_splits(tmp_path, lists, views):
     assert load_capture(path, test_view=None).test_views == ()
 
 
-def test_nerfstudio__leaves_out_views_of_no_split(tmp_path, caplog):
-    lists = {
-        "train_filenames": ["images/cam1.png", "gone.png"],
-        "test_filenames": ["images/cam10.png"],
-    }
-    path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
-    capture = load_capture(path)
-    assert (capture.names, capture.test_views) == (("cam1", "cam10"), (1,))
-    assert "cam2 in none of the splits: left out" in caplog.text
-    assert "`train_filenames` names 1 images without a frame, such as gone.png" in caplog.text
-    path = photos(tmp_path / "b", change=lambda meta: meta.update(train_filenames=[]))
+def test_nerfstudio__needs_a_view_to_train_on(tmp_path):
+    path = photos(tmp_path / "a", change=lambda meta: meta.update(train_filenames=[]))
     with pytest.raises(
-        ValueError, match=r"transforms.json: expected a camera to train on, got none"
+        ValueError, match=r"transforms.json: the splits must leave a camera to train on, got none"
     ):
+        load_capture(path)
+
+
+def synthetic(path, parts, cameras, suffix=""):
+    """Write photos and the files of NeRF's synthetic scenes, which state an angle of view and no
+    size; `parts` are the names of the folders, of a camera each.
+    """
+    for i, (part, camera) in enumerate(zip(parts, cameras, strict=True)):
+        layouts.write_image(path / part / f"{camera.name}.png", i, 0)
+        layouts.transforms(path, [replace(camera, name=f"./{part}/{camera.name}{suffix}")])
+        (frame,) = read_json(path / "transforms.json")["frames"]
+        file = path / f"transforms_{part}.json"
+        angle = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / camera.K[0, 0]), "frames": []}
+        meta = read_json(file) if file.exists() else angle
+        pose = {key: frame[key] for key in ("file_path", "transform_matrix")}
+        meta["frames"].append(pose | {"rotation": 0.1})
+        file.write_text(json.dumps(meta))
+        (path / "transforms.json").unlink()
+    return path
+
+
+def square(names):
+    """Return cameras on a circle with equal intrinsics."""
+    cameras = layouts.rig(names)
+    return [replace(camera, K=cameras[0].K) for camera in cameras]
+
+
+@pytest.mark.parametrize("suffix", ["", ".png"])
+def test_nerfstudio__reads_synthetic_scenes(tmp_path, suffix):
+    """Images of different splits have the same names."""
+    cameras = square(("r_0", "r_1", "r_0"))
+    path = synthetic(tmp_path / "a", ("train", "train", "test"), cameras, suffix)
+    capture = load_capture(path)
+    assert capture.layout == "Nerfstudio"
+    assert (capture.names, capture.test_views) == (("test_r_0", "train_r_0", "train_r_1"), (0,))
+    for camera, i in zip(capture.cameras, (2, 0, 1), strict=True):
+        assert_close(camera.viewmat, cameras[i].viewmat, atol=1e-9)
+        assert_close(camera.K, cameras[i].K, atol=PIXEL_ABS)
+    assert [image[20, 30, 0] for image in next(capture.frames()).images] == [2, 0, 1]
+
+
+def test_nerfstudio__reads_a_synthetic_scene_without_held_out_images(tmp_path):
+    path = synthetic(tmp_path / "a", ("train", "train"), square(("r_0", "r_1")))
+    assert READER.read(path).test_views is None
+    assert load_capture(path).names == ("r_0", "r_1")
+    # BlenderNeRF writes an empty file of held-out images on request.
+    (path / "transforms_test.json").write_text('{"camera_angle_x": 0.7, "frames": []}')
+    assert READER.read(path).test_views == ()
+    assert load_capture(path).names == ("r_0", "r_1")
+
+
+def test_nerfstudio__names_the_files_that_it_does_not_read(tmp_path, caplog):
+    """A `transforms.json` beside the two files has the held-out images, too."""
+    cameras = square(("r_0", "r_1", "r_2", "r_3"))
+    path = synthetic(tmp_path / "a", ("train", "train", "test", "val"), cameras)
+    layouts.transforms(path, [replace(camera, name="train/r_0") for camera in cameras[:1]])
+    capture = load_capture(path)
+    assert (capture.names, capture.test_views) == (("r_0", "r_1", "r_2"), (2,))
+    assert caplog.messages == [
+        f"{path}: not used: transforms.json, transforms_val.json.",
+        f"{path / 'transforms_train.json'} does not calibrate r_3: not used.",
+    ]
+
+
+def test_nerfstudio__masks_the_transparent_background_of_synthetic_scenes(tmp_path):
+    path = synthetic(tmp_path / "a", ("train", "train"), square(("r_0", "r_1")))
+    image = np.dstack([*[np.full((HEIGHT, WIDTH), 9)] * 3, left_half()]).astype(np.uint8)
+    cv2.imwrite(str(path / "train/r_0.png"), image)
+    first, second = load_capture(path).masks
+    assert_array_equal(first, left_half() > 0)
+    assert second is None
+
+
+# ---- recordings in one folder
+# ----------------------------------------------------------------------------
+
+
+def flat(path, names, times=(0, 1), has_time=True):
+    """Write a recording whose names have the camera and the time, and its `transforms.json`, which
+    has the times, too, with `has_time`.
+    """
+    cameras = []
+    for i, camera in enumerate(layouts.rig(("a", "b", "c"))):
+        for t in times:
+            name = names.format(camera="abc"[i], time=t)
+            layouts.write_image(path / "images" / name, i, t)
+            cameras.append(replace(camera, name=f"images/{name}"))
+    layouts.transforms(path, cameras)
+
+    def add_times(meta):
+        for k, entry in enumerate(meta["frames"]):
+            entry["time"] = times[k % len(times)] / 30
+
+    if has_time:
+        edit(path, add_times)
+    return path
+
+
+@pytest.mark.parametrize("names", ["{camera}_{time:04}.png", "{time}_{camera}.jpg"])
+@pytest.mark.parametrize("has_time", [True, False])
+@pytest.mark.parametrize("times", [(0, 1), (0, 2)])
+def test_nerfstudio__reads_a_recording_in_one_folder(tmp_path, names, has_time, times):
+    capture = load_capture(flat(tmp_path / "a", names, times, has_time))
+    assert capture.names == tuple(names.format(camera=c, time=0)[:-4] for c in "abc")
+    assert capture.num_frames == 2
+    assert capture.notes == ()
+    for t, frame in zip(times, capture.frames(), strict=True):
+        expected = np.array([(i, t) for i in range(3)])
+        assert_close([image[20, 30, :2] for image in frame.images], expected, atol=1)
+
+
+def test_nerfstudio__holds_out_a_camera_of_a_recording_in_one_folder(tmp_path):
+    path = flat(tmp_path / "a", "{camera}_{time}.png")
+    meta = read_json(path / "transforms.json")
+    for part, entries in (("train", meta["frames"][:4]), ("test", meta["frames"][4:])):
+        file = path / f"transforms_{part}.json"
+        file.write_text(json.dumps(meta | {"frames": entries}))
+    (path / "transforms.json").unlink()
+    capture = load_capture(path)
+    assert (capture.names, capture.test_views) == (("a_0", "b_0", "c_0"), (2,))
+    assert capture.num_frames == 2
+
+
+def test_nerfstudio__names_cameras_that_its_splits_divide(tmp_path, caplog):
+    path = flat(tmp_path / "a", "{camera}_{time}.png")
+    names = [entry["file_path"] for entry in read_json(path / "transforms.json")["frames"]]
+    edit(path, lambda meta: meta.update(train_filenames=names[:3], test_filenames=names[3:]))
+    assert load_capture(path).test_views == (2,)
+    assert caplog.messages == [
+        f"{path / 'transforms.json'}: all images of b_0 are trained on, because the training split "
+        "has some of them."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("gone", "message"),
+    [
+        (["c_2"], "same numbers without gaps, got a_0 to a_2, b_0 to b_2, c_0 to c_1; leave out"),
+        (["a_1", "b_1", "c_1"], "same numbers without gaps, got a_0 to a_3, b_0 to b_3, c_0 to"),
+        (["a_0", "a_1", "a_3", "b_0", "b_1", "b_3"], "got a_2 to a_2, b_2 to b_2, c_0 to c_3"),
+    ],
+)
+def test_nerfstudio__refuses_a_recording_in_one_folder_with_gaps(tmp_path, gone, message):
+    times = (0, 1, 2, 3) if len(gone) > 1 else (0, 1, 2)
+    path = flat(tmp_path / "a", "{camera}_{time}.png", times)
+
+    def leave_out(meta):
+        meta["frames"] = [f for f in meta["frames"] if f["file_path"][7:-4] not in gone]
+
+    edit(path, leave_out)
+    with pytest.raises(ValueError, match=f"transforms.json: images of equal pose .* {message}"):
         load_capture(path)
 
 
@@ -212,7 +363,7 @@ def test_nerfstudio__takes_missing_sizes_from_clips_once_and_leaves_out_missing_
     reading = Mock(wraps=size_of_clip)
     monkeypatch.setattr("morgs_mi.capture.layouts.nerfstudio.size_of_clip", reading)
     capture = load_capture(path)
-    assert reading.call_count == 2
+    assert reading.call_count == 1
     assert [(camera.name, camera.width) for camera in capture.cameras] == [
         ("cam2", WIDTH),
         ("cam10", WIDTH),

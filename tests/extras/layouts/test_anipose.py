@@ -10,6 +10,7 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.clips import clip_of_camera
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.extras.layouts.anipose import read_anipose
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.testing import assert_close
@@ -68,6 +69,23 @@ def test_anipose__reads_the_tables_of_caliscope(tmp_path):
     (result,), _ = read_anipose(path / "calibration.toml")
     assert result.name == "cam_1"
     assert_close(result.viewmat, camera.viewmat, atol=1e-9)
+
+
+def test_anipose__leaves_out_cameras_that_caliscope_ignores(tmp_path, caplog):
+    path = layouts.anipose(tmp_path / "a")
+    file = path / "calibration.toml"
+    text = file.read_text().replace('name = "camC"', 'name = "camC"\nignore = false')
+    file.write_text(text.replace('name = "camB"', 'name = "camB"\nignore = true'))
+    assert load_capture(path).names == NAMES[::2]
+    assert caplog.messages == [
+        f"{file}: `ignore` is true in cam_1: left out.",
+        f"{file} does not calibrate trial_1-camB: not used.",
+    ]
+    reading = ReadConfig(without=(NAMES[1],))
+    assert load_capture(path, reading=reading).names == NAMES[::2]
+    file.write_text(text.replace("size =", "ignore = true\nsize =").replace("ignore = false", ""))
+    with pytest.raises(ValueError, match=r"expected a table .* without `ignore = true`, got none"):
+        load_capture(path)
 
 
 def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files(tmp_path):
