@@ -41,7 +41,7 @@ from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import errors_at, few
 from morgs_mi.core.files import atomic_path
-from morgs_mi.io.listing import existing_file, listed
+from morgs_mi.io.listing import existing_file
 from morgs_mi.io.numbering import natural_key
 
 _LOG = logging.getLogger(__name__)
@@ -65,28 +65,22 @@ class ColmapModel:
 def find_models(folder: Path) -> list[Path]:
     """Return the folders of the COLMAP models in a capture, of which the first is used.
 
-    They are numbered folders of `sparse`, `sparse` itself, other folders of it, likewise of
-    `colmap/sparse`, or the capture itself. COLMAP writes several models, in any order, if it cannot
-    connect all images: the one of most images is the first.
+    They are numbered folders of `sparse` or `sparse` itself, likewise of `colmap/sparse`, or the
+    capture itself. COLMAP writes several models, in any order, if it cannot connect all images: the
+    one of most images is the first.
     """
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
-        inner = [model for model in listed(place) if _holds_model(model)] if place.is_dir() else []
-        if models := [model for model in inner if model.name.isdecimal()]:
-            return _largest_first(models)
-        if _holds_model(place):
-            return [place]
-        if inner:
-            return _largest_first(inner)
+        numbered = sorted(place.glob("[0-9]*"), key=lambda model: natural_key(model.name))
+        models = [model for model in numbered if model.name.isdecimal() and _holds_model(model)]
+        if len(models) > 1:  # counting reads all images of a model
+            models.sort(key=count_images, reverse=True)
+        if models or _holds_model(place):
+            return models or [place]
     # In a capture itself, a single name may have another meaning.
     is_model = any(
         all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt")
     )
     return [folder] if is_model else []
-
-
-def _largest_first(models: Sequence[Path]) -> list[Path]:
-    models = sorted(models, key=lambda model: natural_key(model.name))
-    return sorted(models, key=count_images, reverse=True) if len(models) > 1 else models
 
 
 def _holds_model(folder: Path) -> bool:
