@@ -3,8 +3,9 @@
 A table per camera (``[cam_0]``, or nested as ``[cameras.0]``) has ``name``, ``size`` [w, h],
 ``matrix`` [3, 3], ``distortions`` in OpenCV's order (k1 k2 p1 p2 k3, or k1 to k4 if ``fisheye`` is
 true), ``rotation`` (Rodrigues vector or matrix) and ``translation``: world -> camera with OpenCV's
-axes. Tables without any of these, such as ``[metadata]``, are ignored. OpenCV puts pixel centres at
-integers, so the principal point is shifted by half a pixel.
+axes. Tables without any of these, such as ``[metadata]``, are not read. Cameras with
+``ignore = true``, which caliscope writes, are left out. OpenCV puts pixel centres at integers, so
+the principal point is shifted by half a pixel.
 
 World units are the units of the file, which does not state them: millimetres or the units of the
 calibration board for Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
@@ -12,6 +13,7 @@ calibration board for Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,10 +31,12 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import MAX_TOML, read_text, read_toml, warn_unread
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
+from morgs_mi.core.checks import LARGEST, bounded, errors_at, few, require
+
+_LOG = logging.getLogger(__name__)
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
-_CAMERA = {*_KEYS, "name", "size", "fisheye"}
+_CAMERA = {*_KEYS, "name", "size", "fisheye", "ignore"}
 # Entries of caliscope, FreeMoCap and Pose2Sim that say nothing about the lenses and poses.
 _HARMLESS = {
     "cam_id",
@@ -40,7 +44,6 @@ _HARMLESS = {
     "error",
     "exposure",
     "grid_count",
-    "ignore",
     "rotation_count",
     "verified_resolutions",
     "metadata",
@@ -64,7 +67,7 @@ _MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=", re.MULTILINE) for key in ("matrix"
 
 
 def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
-    """Return the cameras, named as in the file, and their lenses.
+    """Return the cameras that are not ignored, named as in the file, and their lenses.
 
     Raises:
         ValueError: the file is broken, a key of a camera is missing or has another form, or a
@@ -78,16 +81,20 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
         for key, table in tables.items()
         if isinstance(table, dict) and any(k in table for k in _KEYS)
     }
+    ignored = [key for key, entry in entries.items() if entry.get("ignore")]
     require(
-        entries,
+        len(ignored) < len(entries),
         path,
-        f"expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}",
+        f"expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, and without "
+        "`ignore = true`",
         "none",
         "export the calibration again",
     )
     keys = (content.keys() | tables.keys()) - entries.keys() - {"cameras"}
     warn_unread(path, keys.union(*entries.values()) - _CAMERA - _HARMLESS)
-    pairs = [_camera(path, key, entry) for key, entry in entries.items()]
+    if ignored:
+        _LOG.warning("%s: tables with `ignore = true` are left out: %s.", path, few(ignored))
+    pairs = [_camera(path, key, entry) for key, entry in entries.items() if key not in ignored]
     return [camera for camera, _ in pairs], [lens for _, lens in pairs]
 
 
@@ -101,9 +108,9 @@ def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Len
         shortened(name),
         "name the camera as its clip",
     )
-    width, height = _array(where, entry, "size", (2,)).tolist()
+    size = _array(where, entry, "size", (2,))
     require(
-        width.is_integer() and height.is_integer(),
+        (size % 1 == 0).all(),
         where,
         "`size` must be whole pixels [w, h]",
         entry["size"],
@@ -116,7 +123,8 @@ def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Len
         rotation = Rotation.from_rotvec(rotation).as_matrix()
     viewmat = rigid(where, np.column_stack([rotation, _array(where, entry, "translation", (3,))]))
     with errors_at(where):
-        camera = Camera(K, viewmat, int(width), int(height), _FOLDER.sub(r"\1", str(name)))
+        width, height = size.astype(int).tolist()
+        camera = Camera(K, viewmat, width, height, _FOLDER.sub(r"\1", str(name)))
     is_fisheye = entry.get("fisheye", False)
     counts = [(4,)] if is_fisheye else [(4,), (5,), (8,)]
     k = _array(where, entry, "distortions", *counts).tolist()

@@ -78,7 +78,7 @@ def test_anipose__leaves_out_cameras_that_caliscope_ignores(tmp_path, caplog):
     file.write_text(text.replace('name = "camB"', 'name = "camB"\nignore = true'))
     assert load_capture(path).names == NAMES[::2]
     assert caplog.messages == [
-        f"{file}: `ignore` is true in cam_1: left out.",
+        f"{file}: tables with `ignore = true` are left out: cam_1.",
         f"{file} does not calibrate trial_1-camB: not used.",
     ]
     reading = ReadConfig(without=(NAMES[1],))
