@@ -227,7 +227,11 @@ NERFSTUDIO = {
     ),
     "no pose": (
         transforms(lambda m: m["frames"][0].pop("transform_matrix")),
-        "the pose must be a matrix",
+        "frame 0 .*: `transform_matrix`: the pose must be a matrix",
+    ),
+    "short row": (
+        transforms(lambda m: m["frames"][0]["transform_matrix"][0].pop()),
+        "frame 0 .*: `transform_matrix` must be an array of real numbers, got .*; convert",
     ),
     "no points": (
         transforms(lambda m: m.update(ply_file_path="a.ply")),

@@ -1,19 +1,20 @@
-"""Nerfstudio's `transforms.json`: poses as camera -> world with OpenGL's axes.
+"""Nerfstudio's `transforms.json`, and `transforms_train.json` and `transforms_test.json` of NeRF's
+synthetic scenes: poses as camera -> world with OpenGL's axes.
 
 Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera -> world, x right, y
 up, z backward. Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), lens coefficients and `mask_path`
 are keys of the file or of a frame; the frame's take precedence. `w` and `h` may be missing. Pixel
 centres lie at +0.5, as in `Camera`. World units are the units of the matrices: `applied_transform`
 and `applied_scale` are not undone. `train_filenames`, `val_filenames` and `test_filenames` split
-the images.
+the images by their `file_path`; of the two files, the second has the held-out images.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from functools import cache
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -31,9 +32,10 @@ from morgs_mi.capture.layouts.clips import clip_of_image, size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.camera import Camera, intrinsic_matrix, rigid
-from morgs_mi.core.checks import LARGEST, errors_at
-from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, existing_file
+from morgs_mi.core.checks import check_number, errors_at, few, numbers, require
+from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply import read_vertices
+from morgs_mi.io.video import Clip
 
 _LOG = logging.getLogger(__name__)
 
@@ -48,6 +50,7 @@ _KEYS = {
     *_DISTORTION,
     *_SPLITS,
     "frames",
+    "time",
     "file_path",
     "transform_matrix",
     "ply_file_path",
@@ -82,7 +85,6 @@ _HARMLESS = {
     "depth_file_path",
     "normal_file_path",
     "timestamp",
-    "time",
     "rotation",
     "near",
     "far",
@@ -91,56 +93,52 @@ _HARMLESS = {
     "date",
 }
 
-# Kinds of values: their test, and in words.
-_Kind = tuple[Callable[[Any], bool], str]
-_NUMBER: _Kind = (
-    lambda value: type(value) in (int, float) and abs(value) <= LARGEST,
-    f"be a finite number of at most {LARGEST:g}, here or at the top of the file",
-)
-_FILE: _Kind = (lambda value: value is None or isinstance(value, str), "name a file")
-_NAMES: _Kind = (lambda value: value is None or _is_list(value, str), "be a list of names")
-_KINDS: dict[str, _Kind] = {
-    "frames": (lambda value: value != [] and _is_list(value, dict), "be a list of objects"),
-    "file_path": (lambda value: value != "" and isinstance(value, str), "name a file"),
-    "is_fisheye": (lambda value: value in (True, False), "be true or false"),
-    "mask_path": _FILE,
-    "ply_file_path": _FILE,
-    **dict.fromkeys(_SPLITS, _NAMES),
-}
+
+@dataclass(frozen=True)
+class _View:
+    """One entry of `frames`."""
+
+    camera: Camera
+    lens: Lens
+    place: PurePosixPath  # `file_path`
+    masks: tuple[Path, ...]  # the file at `mask_path`, if there is one
+    time: str
 
 
-def _beside(path: Path, name: str | None) -> Path | None:
-    """Return the file that the file `path` names, or None."""
-    return path.parent / name.replace("\\", "/") if name else None
+def _place(name: Any) -> PurePosixPath:
+    """Return the place of a file that a value names, relative to the capture."""
+    return PurePosixPath(str(name).replace("\\", "/"))
 
 
-def _is_list(value: Any, kind: type) -> bool:
-    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
-
-
-def _value(values: Mapping[str, Any], key: str, default: Any = None) -> Any:
-    """Return a value of the file, of the kind that its key has."""
+def _number(
+    where: str,
+    values: Mapping[str, Any],
+    key: str,
+    default: float | None = None,
+    interval: str = "[-1e12, 1e12]",
+) -> float:
     value = values.get(key, default)
-    is_kind, kind = _KINDS.get(key, _NUMBER)
-    if not is_kind(value):
-        raise ValueError(f"`{key}` must {kind}, got {repr(value)[:80]}; export it again.")
+    check_number(where, key, value, interval)
     return value
 
 
-def _camera(values: Mapping[str, Any], name: str) -> Camera:
-    width = _value(values, "w")
-    height = _value(values, "h")
-    fx = _focal_length(values, "x", width)
-    fy = _focal_length(values, "y", height, fx)
-    cx = _value(values, "cx", width / 2)
-    cy = _value(values, "cy", height / 2)
+def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
+    width = _number(where, values, "w")
+    height = _number(where, values, "h")
+    fx = _focal_length(where, values, "x", width)
+    fy = _focal_length(where, values, "y", height, fx)
+    cx = _number(where, values, "cx", width / 2)
+    cy = _number(where, values, "cy", height / 2)
     K = intrinsic_matrix(fx, fy, cx, cy)
-    pose = rigid("`transform_matrix`", np.array(values.get("transform_matrix"), np.float64))
-    return Camera(K, np.linalg.inv(pose @ _OPENGL_FROM_OPENCV), round(width), round(height), name)
+    matrix = numbers(where, "transform_matrix", values.get("transform_matrix", []))
+    pose = rigid(f"{where}: `transform_matrix`", matrix)
+    with errors_at(where):
+        viewmat = np.linalg.inv(pose @ _OPENGL_FROM_OPENCV)
+        return Camera(K, viewmat, round(width), round(height), name)
 
 
 def _focal_length(
-    values: Mapping[str, Any], axis: str, size: float, default: float | None = None
+    where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None
 ) -> float:
     """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image
     has `size` px.
@@ -148,22 +146,25 @@ def _focal_length(
     key = f"fl_{axis}"
     angle = f"camera_angle_{axis}"
     if key not in values and angle in values:
-        return float(0.5 * size / np.tan(0.5 * _value(values, angle)))
-    return _value(values, key, default)
+        return 0.5 * size / math.tan(0.5 * _number(where, values, angle, interval="(0, 3.14159)"))
+    return _number(where, values, key, default)
 
 
-def _lens(values: Mapping[str, Any]) -> Lens:
+def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     model = values.get("camera_model", "OPENCV")
-    k1, k2, k3, k4, p1, p2 = (_value(values, key, 0.0) for key in _DISTORTION)
-    if _value(values, "is_fisheye", False) or model == "OPENCV_FISHEYE":
+    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
+    if values.get("is_fisheye") or model == "OPENCV_FISHEYE":
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
     # Nerfstudio's k4 is the coefficient of r^8, for which COLMAP has no model. OpenCV's k4 is in
     # the denominator.
-    if model not in _PERSPECTIVE or k4:
-        raise ValueError(
-            f"`camera_model` must be OPENCV_FISHEYE, or with a `k4` of 0 one of "
-            f"{', '.join(_PERSPECTIVE)}, got {model!r} with {k4:g}; undistort the images first."
-        )
+    require(
+        model in _PERSPECTIVE and k4 == 0,
+        where,
+        "`camera_model` must be OPENCV_FISHEYE, or with a `k4` of 0 one of "
+        f"{', '.join(_PERSPECTIVE)}",
+        f"{model!r} with {k4:g}",
+        "undistort the images first",
+    )
     return opencv_lens((k1, k2, p1, p2, k3))
 
 
@@ -189,108 +190,145 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return points, colors.astype(np.float32) / np.float32(scale)
 
 
-def _read_calibration(path: Path) -> Calibration:
-    clips = required_clips(path)
-    source = path / "transforms.json"
+def _sources(path: Path) -> list[Path]:
+    """Return the calibration of a capture, and the file of the held-out cameras if there is one."""
+    train = path / "transforms_train.json"
+    # Converters that split their images also write all of them to `transforms.json`.
+    files = (
+        [train, path / "transforms_test.json"] if train.is_file() else [path / "transforms.json"]
+    )
+    return list(filter(Path.is_file, files))
+
+
+def _read_meta(
+    path: Path, source: Path, clips: Mapping[str, Clip]
+) -> tuple[Mapping[str, Any], list[_View]]:
+    """Return the content of a file, and its entries of `frames`."""
     meta = read_json(source)
-    meta = meta if isinstance(meta, dict) else {}
-    with errors_at(source):
-        frames = _value(meta, "frames")
-        points_file = _beside(source, _value(meta, "ply_file_path"))
-        splits = {split: names for split in _SPLITS if (names := _value(meta, split)) is not None}
-    cameras = []
-    lenses = []
-    masks = []
-    size_of = cache(size_of_clip)  # many images may be in one clip
-    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
+    require(
+        isinstance(meta, dict), source, "expected an object", repr(meta)[:80], "export it again"
+    )
+    frames = meta.get("frames")
+    require(
+        isinstance(frames, list) and {*map(type, frames)} <= {dict},
+        source,
+        "`frames` must be a list of objects",
+        repr(frames)[:80],
+        "export it again",
+    )
+    keys = set().union(meta, *frames)
+    if frames and not {"w", "h"} <= keys:
+        files = (clip_of_image(path, str(frame.get("file_path")), clips) for frame in frames)
+        file = next(filter(None, files), None)
+        if file is None:
+            raise FileNotFoundError(
+                f"{source}: expected `w` and `h`, or an image of their size, found none; copy the "
+                "images, or remove this file."
+            )
+        meta["w"], meta["h"] = size_of_clip(file)
+    warn_unread(source, keys - _KEYS - _HARMLESS)
+    views = []
     for index, frame in enumerate(frames):
         values = meta | frame
-        with errors_at(f"{source}, frame {index}"):
-            name = _value(values, "file_path")
-        if not {"w", "h"} <= values.keys():
-            # Of another image if it is missing: its camera is left out later.
-            names = [name, *(str(other.get("file_path")) for other in frames)]
-            file = next(filter(None, (clip_of_image(path, each, clips) for each in names)), None)
-            values |= zip(("w", "h"), () if file is None else size_of(file), strict=False)
-        with errors_at(f"{source}, frame {index} ({name})"):
-            cameras.append(_camera(values, name))
-            lenses.append(_lens(values))
-            masks.append(_beside(source, _value(values, "mask_path")))
-        if lenses[-1].model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
-            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
-    warn_unread(source, unread)
-    points, colors = read_points_ply(points_file) if points_file else (NO_POINTS, NO_POINTS)
-    calibration, images = match_clips(path, source, clips, cameras, lenses)
-    clip_masks = tuple(
-        tuple(dict.fromkeys(file for index in indices if (file := masks[index])))
-        for indices in images
+        where = f"{source}, frame {index}"
+        name = values.get("file_path")
+        require(
+            isinstance(name, str) and name,
+            where,
+            "`file_path` must name a file",
+            repr(name),
+            "export it again",
+        )
+        where = f"{where} ({name})"
+        mask = values.get("mask_path")
+        views.append(
+            _View(
+                _camera(where, values, name),
+                _lens(where, values),
+                _place(name),
+                (path / _place(mask),) if mask else (),
+                str(values.get("time")),
+            )
+        )
+    return meta, views
+
+
+def _read_calibration(path: Path) -> Calibration:
+    clips = required_clips(path)
+    source, *others = _sources(path)
+    if unread := sorted({*path.glob("transforms*.json")} - {source, *others}):
+        _LOG.warning("%s: not used: %s.", path, few([file.name for file in unread]))
+    meta, views = _read_meta(path, source, clips)
+    splits: dict[str, set[PurePosixPath]] = {}
+    for key in _SPLITS:
+        if (names := meta.get(key)) is not None:
+            is_list = isinstance(names, list)
+            require(is_list, source, f"`{key}` must be a list", repr(names)[:80], "export it again")
+            splits[key] = set(map(_place, names))
+    for other in others:
+        splits["train_filenames"] = {view.place for view in views}
+        views += _read_meta(path, other, clips)[1]
+    require(views, source, "`frames` must have an entry for each camera", "none", "export it again")
+    places = {view.place for view in views}
+    unknown = sorted(set().union(*splits.values()) - places)
+    require(
+        not unknown,
+        source,
+        "the splits must name images by their `file_path`",
+        few(unknown, 4),
+        "correct or remove these names",
     )
-    calibration = replace(
+    calibration, images = match_clips(
+        path, source, clips, [view.camera for view in views], [view.lens for view in views]
+    )
+    times = {view.time for view in views}
+    require(
+        len(times) <= len(images[0]),
+        source,
+        f"`time` must have as many values as each camera has images, {len(images[0])}, because "
+        "cameras are fixed",
+        len(times),
+        "record by fixed cameras, or remove `time` if nothing moves",
+    )
+    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
+    training = splits.get("train_filenames", places - held_out)
+    # Per camera whether its images are trained on: true, false or both.
+    trained = [{views[index].place in training for index in indices} for indices in images]
+    if mixed := [calibration.names[view] for view, kinds in enumerate(trained) if len(kinds) > 1]:
+        _LOG.warning(
+            "%s: all images of %s are trained on, because the training split has some of them.",
+            source,
+            few(mixed),
+        )
+    test_views = tuple(view for view, kinds in enumerate(trained) if kinds == {False})
+    require(
+        len(test_views) < len(images),
+        source,
+        "the splits must leave a camera to train on",
+        "none",
+        "add one to the training split",
+    )
+    masks = tuple(
+        tuple(sorted({*masks, *(mask for index in indices for mask in views[index].masks)}))
+        for masks, indices in zip(calibration.masks, images, strict=True)
+    )
+    points_file = meta.get("ply_file_path")
+    points, colors = (
+        read_points_ply(path / _place(points_file)) if points_file else (NO_POINTS, NO_POINTS)
+    )
+    return replace(
         calibration,
         points=points,
         point_colors=colors,
-        masks=clip_masks if any(clip_masks) else calibration.masks,
+        masks=masks,
+        test_views=test_views if splits else None,
     )
-    if not splits:
-        return calibration
-    # A camera is trained on if one of its images is: is in `train_filenames` or, without these, in
-    # no other split.
-    indices = _images_named(source, splits, [camera.name for camera in cameras])
-    held_out = indices.get("val_filenames", set()) | indices.get("test_filenames", set())
-    training = indices.get("train_filenames", set(range(len(cameras))) - held_out)
-    views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
-    if len(views) == len(images):
-        raise ValueError(
-            f"{source}: expected a camera to train on, got none in the splits; add one to the "
-            "training split."
-        )
-    calibration = replace(calibration, test_views=views)
-    if extras := [calibration.names[view] for view in views if held_out.isdisjoint(images[view])]:
-        _LOG.warning("%s: %s in none of the splits: left out.", source, ", ".join(extras))
-    return calibration.without(path, extras)
-
-
-def _images_named(
-    source: Path, splits: Mapping[str, Sequence[str]], names: Sequence[str]
-) -> dict[str, set[int]]:
-    """Return the indices of the images `names` in each split, which names them in full or by the
-    end of one path alone.
-    """
-    places = list(map(_parts, names))
-    images: dict[str, set[int]] = {}
-    for split, split_names in splits.items():
-        images[split] = set()
-        unknown = []
-        for name in split_names:
-            parts = _parts(name)
-            ends = {i for i, place in enumerate(places) if place[-len(parts) :] == parts}
-            whole = {i for i in ends if places[i] == parts}
-            if not whole and len(ends) != 1:
-                unknown.append(name)
-            else:
-                images[split] |= whole or ends
-        if unknown:
-            _LOG.warning(
-                "%s: `%s` names %d images without a frame, such as %s.",
-                source,
-                split,
-                len(unknown),
-                unknown[0],
-            )
-    return images
-
-
-def _parts(name: str) -> tuple[str, ...]:
-    """Return the parts of an image's path without the suffix of its format."""
-    place = PurePosixPath(name.replace("\\", "/"))
-    has_suffix = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, EXR_SUFFIX)
-    return (place.with_suffix("") if has_suffix else place).parts
 
 
 READER = Reader(
     "Nerfstudio",
-    ("transforms.json",),
-    lambda path: (path / "transforms.json").is_file(),
+    ("transforms.json", "transforms_train.json"),
+    lambda path: bool(_sources(path)),
     _read_calibration,
     PoseConvention("camera to world", "OpenGL"),
 )

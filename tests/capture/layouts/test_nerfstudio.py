@@ -280,16 +280,20 @@ def test_nerfstudio__reads_a_recording_in_one_folder(tmp_path, names, has_time, 
         assert_close([image[20, 30, :2] for image in frame.images], expected, atol=1)
 
 
-def test_nerfstudio__holds_out_a_camera_of_a_recording_in_one_folder(tmp_path):
+def test_nerfstudio__holds_out_a_camera_of_a_recording_in_one_folder(tmp_path, caplog):
     path = flat(tmp_path / "a", "{camera}_{time}.png")
     meta = read_json(path / "transforms.json")
     for part, entries in (("train", meta["frames"][:4]), ("test", meta["frames"][4:])):
         file = path / f"transforms_{part}.json"
         file.write_text(json.dumps(meta | {"frames": entries}))
     (path / "transforms.json").unlink()
+    write_mask(path / "masks/b_0.png.png", left_half())
+    write_mask(path / "masks/b_1.png.png", left_half())
     capture = load_capture(path)
     assert (capture.names, capture.test_views) == (("a_0", "b_0", "c_0"), (2,))
     assert capture.num_frames == 2
+    assert_array_equal(capture.masks[1], left_half() > 0)
+    assert caplog.messages == []
 
 
 def test_nerfstudio__names_cameras_that_its_splits_divide(tmp_path, caplog):
