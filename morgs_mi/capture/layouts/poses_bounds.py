@@ -47,7 +47,8 @@ def read_poses_bounds(
         )
     cameras = []
     for i, (row, name) in enumerate(zip(rows.astype(np.float64), names, strict=True)):
-        with errors_at(f"{path}, row {i} ({name})"):
+        # Poses of any numbers become NaN or infinite without a warning, and are then refused.
+        with errors_at(f"{path}, row {i} ({name})"), np.errstate(all="ignore"):
             down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
             pose = pose_at(np.stack([right, down, -back]), centre)
             viewmat = rigid("columns in the order down, right, back", pose)

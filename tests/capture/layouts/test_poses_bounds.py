@@ -62,6 +62,10 @@ def test_read_poses_bounds__columns_are_down_right_back(tmp_path):
             r"row 0 \(cam00\): .*: the pose must be finite",
         ),
         (
+            lambda rows: np.where(np.arange(17) == 3, 1e308, rows),
+            r"row 0 \(cam00\): .*: the pose must be finite",
+        ),
+        (
             lambda rows: np.where(np.arange(17) % 5, rows, -rows),
             r"row 0 \(cam00\): columns in the order down, right, back: the axes must be a "
             r"right-handed",
