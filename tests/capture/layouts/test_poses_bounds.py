@@ -79,6 +79,7 @@ def test_read_poses_bounds__columns_are_down_right_back(tmp_path):
         (lambda rows: rows.astype(object), "got a broken file"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_read_poses_bounds__refuses_bad_files(tmp_path, change, message):
     path = tmp_path / "poses_bounds.npy"
     write_poses_bounds(path, cameras(), BOUNDS)
