@@ -10,7 +10,6 @@ from tyro.conf import Positional
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import (
-    optional,
     options,
     place,
 )
@@ -29,13 +28,13 @@ class Accuracy:
     """Plot, beside which a .json has all results; by default stream-accuracy.png or
     FILE-accuracy.png beside SOURCE. Needs the extra plots.
     """
-    camera: Annotated[str | None, optional("CAMERA")] = None
-    """Camera by index or name; by default the first one, for a file of Gaussians the one with most
+    camera: tuple[str, ...] = ()
+    """Cameras by index or name; by default the first one, for a file of Gaussians the one with most
     detail in view.
     """
     tolerance: float = 1e-3
-    """Largest relative error of the image and of each gradient, for the choice of the fastest
-    settings.
+    """Largest relative error of the image and of each gradient in all cameras, for the choice of
+    the fastest settings.
     """
     drop_invalid: DropInvalid = False
 
@@ -46,15 +45,15 @@ class Accuracy:
         from morgs_mi.playback.stream_header import find_camera
 
         stream = opened(self.source, self.drop_invalid)
-        view = find_camera(stream, self.camera or 0)
+        views = [find_camera(stream, camera) for camera in self.camera or (0,)]
         beside = stream.path.with_name(f"{stream.path.stem}-accuracy.png")
         plot = check_output(self.output or beside)
         check_plot(plot)
         gaussians = next(stream.states()).gaussians
         with progress() as report:
-            result = accuracy(gaussians, view, tolerance=self.tolerance, progress=report)
+            result = accuracy(gaussians, views, tolerance=self.tolerance, progress=report)
         print_table(result.table())
-        result.plot(plot)
+        result.plot(plot, stream.path.name)
         results = plot.with_suffix(".json")
         write_json(results, result.as_dict())
-        print_result(f"Plot: {plot}\nAll results: {results}")
+        print_result(f"{result.sentence}\nPlot: {plot}\nAll results: {results}")

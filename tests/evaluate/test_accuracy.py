@@ -1,6 +1,7 @@
 """Error against run time of the renderer, compared with a reference in float64."""
 
 import sys
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -10,7 +11,7 @@ from rich.console import Console
 from benchmarks.workloads import ball
 from morgs_mi import RenderConfig, accuracy
 from morgs_mi.evaluate import accuracy as module
-from morgs_mi.evaluate.accuracy import ATTRIBUTES, reference64
+from morgs_mi.evaluate.accuracy import ATTRIBUTES, Setting, chosen, reference64
 from tests import reference
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import as_float32, isotropic, make_scene, to_gaussians
@@ -58,8 +59,48 @@ def test_accuracy__selects_the_fastest_setting_within_the_tolerance(few_settings
     assert (
         result.config == fine.config == RenderConfig(alpha_min=1 / 65280, stop_transmittance=1e-6)
     )
-    assert accuracy(gaussians, camera, tolerance=1e-8).config is None
+    assert result.sentence.startswith("Within 0.001 in 1 camera: 1/65280, 1e-06, ")
+    none = accuracy(gaussians, camera, tolerance=1e-8)
+    assert none.config is None
+    assert "None of the settings is within 1e-08 in 1 camera: the most exact, 1/65" in none.sentence
     assert accuracy(gaussians, camera, RenderConfig(antialiased=True)).config.antialiased
+
+
+def row(name, seconds, error, checked=0.0):
+    return Setting(name, RenderConfig(), seconds, {"image": error, "means": error / 2}, checked)
+
+
+@pytest.mark.parametrize(
+    ("rows", "name"),
+    [
+        ([row("a", 1.0, 1e-4), row("b", 1.04, 1e-5), row("c", 1.2, 1e-6)], "b"),
+        ([row("a", 1.0, 2e-3), row("b", 1.5, 1e-4)], "b"),
+        ([row("a", 1.0, 1e-4, 2e-3), row("b", 1.5, 1e-4, 1e-4)], "b"),
+        ([row("a", 1.0, 2e-3)], None),
+    ],
+)
+def test_chosen__is_the_most_exact_of_the_fast_settings_within_the_tolerance(rows, name):
+    choice = chosen(rows, 1e-3)
+    assert (choice and choice.name) == name
+
+
+def test_accuracy__counts_the_worst_of_several_cameras(few_settings):
+    gaussians, camera = ball(0, 300, 40, 24, 0.1, 1)
+    other = replace(camera, K=camera.K * [[3, 1, 1], [1, 3, 1], [1, 1, 1]])
+    both = accuracy(gaussians, [camera, other])
+    worst = [accuracy(gaussians, view).rows for view in (camera, other)]
+    assert both.cameras == 2
+    for k, setting in enumerate(both.rows):
+        errors = [rows[k].errors["image"] for rows in worst]
+        assert setting.errors["image"] == pytest.approx(max(errors), rel=0.5)
+
+
+def test_accuracy__finds_an_object_of_few_pixels(few_settings):
+    """It is on four of 10,000 pixels, which 512 random pixels of the image would miss."""
+    gaussians = isotropic([[0, 0, 3]], 0.01, 0.9, (1, 1, 1))
+    result = accuracy(gaussians, make_camera(100, 100))
+    assert result.config is not None
+    assert result.rows[1].error < 1e-3
 
 
 def test_accuracy__errors_of_gradients_that_vanish_are_relative_to_the_others(few_settings):
@@ -90,9 +131,10 @@ def test_accuracy__is_shown_as_table_and_plot_or_without_matplotlib(few_settings
     ("changes", "message"),
     [
         ({"gaussians": "a.ply"}, r"rasterize\(\): `gaussians` must be Gaussians, got a str"),
-        ({"gaussians": isotropic(np.zeros((0, 3)), 1, 0.5, (1, 1, 1))}, "must see Gaussians in"),
+        ({"gaussians": isotropic(np.zeros((0, 3)), 1, 0.5, (1, 1, 1))}, "must see Gaussians, got"),
         ({"gaussians": isotropic([[0, 0, -5]], 0.1, 0.5, (1, 1, 1))}, "must see .*, got none; cho"),
-        ({"camera": None}, r"Camera\.from_sensor\(\): `sensor` must be a `perspective` sensor"),
+        ({"cameras": None}, r"Camera\.from_sensor\(\): `sensor` must be a `perspective` sensor"),
+        ({"cameras": []}, r"`cameras` must have a camera, got none"),
         ({"config": {}}, r"accuracy\(\): `config` must be a .*RenderConfig, got a dict"),
         ({"tolerance": float("nan")}, r"`tolerance` must be a number in \(0, inf\), got nan"),
         ({"tolerance": -1}, r"`tolerance` must be a number in \(0, inf\), got -1"),
@@ -100,7 +142,7 @@ def test_accuracy__is_shown_as_table_and_plot_or_without_matplotlib(few_settings
 )
 def test_accuracy__refuses_bad_arguments(changes, message):
     gaussians = isotropic([[0, 0, 3]], 0.1, 0.5, (1, 1, 1))
-    arguments = {"gaussians": gaussians, "camera": make_camera(13, 9), **changes}
+    arguments = {"gaussians": gaussians, "cameras": make_camera(13, 9), **changes}
     with pytest.raises(ValueError, match=message):
         accuracy(**arguments)
 
