@@ -123,7 +123,7 @@ def step(
     report = replace(
         fitted,
         seconds=time.perf_counter() - start_time,
-        status="; ".join([*([] if fitted.status == "ok" else [fitted.status]), *problems]) or "ok",
+        status="; ".join(filter(None, [fitted.status, *problems])) or "ok",
         missing_views=tuple(
             camera.name for v, camera in enumerate(setup.cameras) if v not in present
         ),
@@ -180,7 +180,8 @@ def _fit_later_frame(
         num_bytes=packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(fitted.gaussians),
-        status="ok" if images else "no view has an image",
+        psnr=fitted.psnr,
+        status=fitted.problem if images else "no view has an image",
         active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
         steps=fitted.epochs * len(active.views),
         exposures=state.exposures,

@@ -38,13 +38,15 @@ from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.optimise import (
     Steps,
     adam,
+    fit_problem,
     optimise,
+    pop_psnr,
     replace_parameter,
     values_of,
     view_order,
 )
 from morgs_mi.fit.view import half_sized
-from morgs_mi.method.objective import mask_loss, recon_loss
+from morgs_mi.method.objective import SQUARED_ERROR, mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import rasterize
@@ -159,6 +161,8 @@ class FirstFrame:
     gaussians: Gaussians  #: The fitted Gaussians.
     losses: dict[str, float]  #: Means over the last steps, by name.
     steps: int  #: Number of steps.
+    psnr: float  #: Of the training views in the last steps, dB; NaN without a step.
+    problem: str  #: A sentence if that is worse than a constant image; empty otherwise.
 
 
 def fit_first_frame(
@@ -202,7 +206,9 @@ def fit_first_frame(
     def losses_at(parameters: Tensors, view: int) -> Tensors:
         gaussians = dropped(start.with_parameters(parameters), config.dropout or 0.0, rng)
         image = views[view].render(gaussians)
-        return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
+        target = targets[view]
+        loss = recon_loss(image.color, target, config.objective.dssim_weight)
+        return {"recon": loss, SQUARED_ERROR: target.mse}
 
     control = DensityControl(problem.cameras, config.density, problem.extent, rng)
     losses = {}
@@ -233,7 +239,10 @@ def fit_first_frame(
         losses = optimise(optimizer, rates, losses_at, chunk)
     if pace.count < steps:  # perhaps the last ones were skipped
         progress(steps, steps)
-    return FirstFrame(start.with_parameters(values_of(optimizer)), losses, pace.count)
+    psnr = pop_psnr(losses)
+    problem_text = fit_problem(psnr, (target.constant_error() for target in targets))
+    gaussians = start.with_parameters(values_of(optimizer))
+    return FirstFrame(gaussians, losses, pace.count, psnr, problem_text)
 
 
 def density_rounds(config: FitConfig) -> list[int]:

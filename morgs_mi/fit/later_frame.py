@@ -15,13 +15,22 @@ from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Arrays, Tensors
 from morgs_mi.fit.density import DensityControl, apply_plan
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
+from morgs_mi.fit.optimise import (
+    Steps,
+    adam,
+    fit_problem,
+    optimise,
+    pop_psnr,
+    values_of,
+    view_order,
+)
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.objective import (
+    SQUARED_ERROR,
     Prediction,
     channels_of,
     losses_of,
@@ -68,6 +77,9 @@ class LaterFrame:
     source: np.ndarray
     losses: dict[str, float]  #: Mean losses of the last epoch, by the names of the terms.
     epochs: int  #: Number of epochs that were run.
+    #: Of the active views in the last epoch, in the pixels that were fitted, dB; NaN without one.
+    psnr: float
+    problem: str  #: A sentence if that is worse than a constant image; empty otherwise.
 
 
 def fit_later_frame(
@@ -92,7 +104,7 @@ def fit_later_frame(
     count = len(views)
     if not count or not len(active.indices):
         source = np.arange(len(problem.previous))
-        return LaterFrame(at_rest(problem.previous), source, {}, 0)
+        return LaterFrame(at_rest(problem.previous), source, {}, 0, np.nan, "")
     progress = progress or Progress()
     objective = config.objective
     order = [views[k] for k in view_order(count, config.epochs * count, rng)]
@@ -148,11 +160,13 @@ def fit_later_frame(
             problem.extent,
             gaussians,
         )
-        return losses_of(prediction, observed, objective)
+        losses = losses_of(prediction, observed, objective)
+        return {**losses, SQUARED_ERROR: problem.targets[index].mse}
 
     start = problem.start
     losses = dict[str, float]()
     epochs = 0
+    psnr = np.nan
     factory = MOTION_MODELS.make(motion.model, motion)
     if factory is not None:
         epochs = max(1, round(motion.model_share * config.epochs))
@@ -197,10 +211,12 @@ def fit_later_frame(
             shared = {"neighbours": find_neighbours(previous, problem.extent)}
         rates = config.rates_at(epochs).by_parameter(problem.extent)
         losses = optimise(optimizer, rates, losses_at, steps_of(epochs), weights)
+        psnr = pop_psnr(losses)
         objectives.append(sum(weights[name] * loss for name, loss in losses.items()))
         epochs += 1
     result, source = active.merge(problem.previous, gaussians(), source)
-    return LaterFrame(result, source, losses, epochs)
+    constant_errors = (problem.targets[v].constant_error(w.region) for v, w in active.views.items())
+    return LaterFrame(result, source, losses, epochs, psnr, fit_problem(psnr, constant_errors))
 
 
 def _fit_motion(

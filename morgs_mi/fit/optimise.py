@@ -14,7 +14,12 @@ from drjit.opt import Adam
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Arrays, Tensor, Tensors
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
+from morgs_mi.method.objective import SQUARED_ERROR
 from morgs_mi.render.kernel_recording import render_lock
+
+# PSNR of training views below which it is compared with constant images, dB. Recordings are fitted
+# better; what changes in a later frame may be a surface of one colour.
+_DOUBTFUL = 20.0
 
 
 def adam(parameters: Tensors, momentum: float = 0.9) -> Adam:
@@ -152,6 +157,36 @@ def optimise(
             "steps; lower the learning rates."
         )
     return means
+
+
+def pop_psnr(losses: dict[str, float]) -> float:
+    """Remove the mean squared error from the losses, and return its PSNR, dB; NaN if there is
+    none.
+    """
+    return _psnr(losses.pop(SQUARED_ERROR, np.nan))
+
+
+def _psnr(error: float) -> float:
+    return float(-10 * np.log10(np.maximum(error, 1e-10)))
+
+
+def fit_problem(psnr: float, constant_errors: Iterable[float]) -> str:
+    """Return a sentence if training views are worse than images of one colour; otherwise nothing.
+
+    Args:
+        psnr: of the fitted images, dB; NaN: nothing was fitted.
+        constant_errors: mean squared errors of the best images of one colour, one for each view.
+    """
+    if not psnr < _DOUBTFUL:
+        return ""
+    constant_psnr = _psnr(float(np.mean([*constant_errors])))
+    if psnr >= constant_psnr:
+        return ""
+    return (
+        f"the training views have {psnr:.1f} dB, worse than constant images with "
+        f"{constant_psnr:.1f} dB: the fit diverged, had too few steps, or shows nothing; lower "
+        "learning rates that were raised, and check the poses (morgs-mi info)"
+    )
 
 
 def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int]:

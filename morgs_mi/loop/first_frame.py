@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_type, numbers
+from morgs_mi.core.checks import check_type, numbers, quantity
 from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
@@ -125,13 +125,12 @@ def fitted_first_frame(
     problem = FirstFrameProblem.of(views, cloud, plan, config.render, rng)
     fit_config = adapted_to_images(plan, problem)
 
-    status = "ok"
+    problem_of_points = ""
     if (count := len(setup.points)) < MIN_POINTS:
-        status = (
-            f"the capture has {count} points, too few: seeded {plan.first_count} random "
-            "ones inside the views"
+        problem_of_points = (
+            f"the capture has {quantity(count, 'point')}, too few: seeded {plan.first_count} "
+            "random ones inside the views"
         )
-        _LOG.warning("frame 0: %s", status)
     validation: dict[str, Any] = {}
     if len(views) > 1:
         expected = forecast(problem.cameras, problem.points)
@@ -144,6 +143,9 @@ def fitted_first_frame(
     elif limit is not None:
         limit = max(limit - (time.perf_counter() - begin), 1.0)
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round, limit)
+    problems = list(filter(None, [problem_of_points, fitted.problem]))
+    for sentence in problems:
+        _LOG.warning("frame 0: %s", sentence)
     packet = keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec)
     report = FrameReport(
         frame=0,
@@ -151,7 +153,8 @@ def fitted_first_frame(
         num_bytes=packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(fitted.gaussians),
-        status=status,
+        psnr=fitted.psnr,
+        status="; ".join(problems),
         validation=validation,
         steps=fitted.steps,
         exposures=exposures,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +21,9 @@ class FrameReport:
         num_bytes: size of the packet in the stream.
         losses: means over the last steps, by the names of the terms.
         num_gaussians: number of Gaussians of the frame.
+        psnr: of the training views, dB, by their mean squared error in the last steps, in the
+            pixels that were fitted: all valid ones in the first frame, with its dropout, and those
+            of the active set in later ones. NaN if nothing was fitted.
         status: "ok", or a sentence about a problem and how it was handled.
         missing_views: names of the views without an image.
         active: fractions that took part, by name: gaussians, views, pixels, epochs.
@@ -46,6 +50,7 @@ class FrameReport:
     exposures: tuple[Exposure, ...] = ()
     memory: dict[str, int] = field(default_factory=dict)
     fingerprints: tuple[str, ...] = ()
+    psnr: float = math.nan
 
     def __repr__(self) -> str:
         gaussians = quantity(self.num_gaussians, "Gaussian")

@@ -100,6 +100,10 @@ def offset_loss(offset: Tensor, extent: float, num_gaussians: int) -> Tensor:
     return dr.sum(dr.abs(offset.array)) * dr.opaque(mi.Float, 1 / (num_gaussians * extent))
 
 
+SQUARED_ERROR = "mse"
+"""Name of the mean squared error of the images beside the losses; it has no weight and no
+derivative.
+"""
 Observations = Mapping[str, Any]
 
 
@@ -261,7 +265,7 @@ def loss_term(
     Raises:
         ValueError: the name is taken, empty, or has a colon.
     """
-    if name in (term.name for term in TERMS):
+    if name in (SQUARED_ERROR, *(term.name for term in TERMS)):
         raise ValueError(
             f"loss_term(): `name` must be new, got {name!r}, which the objective has already; "
             "rename it."

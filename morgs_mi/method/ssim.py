@@ -29,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.memory import from_numpy, owned_copy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.method.ssim_layout import (
@@ -61,6 +62,7 @@ class _Windows:
     windows: Lanes  # runs of the centres of the windows
     count: int  # of the windows, one for each colour
     pixels: Lanes  # runs of the pixels
+    num_valid: int  # of the pixels, one for each colour
     mean: Float  # planes of M y, defined on `windows`
     variance: Float  # planes of M yy - (M y)^2, likewise
 
@@ -74,8 +76,12 @@ class Target:
         mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
     """
 
+    #: Mean squared error of the image that was compared last, over the valid pixels of its region.
+    mse: Float
+
     def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
         self.shape: tuple[int, ...] = image.shape
+        self._mask = mask
         self.planes = Planes(*image.shape[:2])
         self.weight: Float | None = None
         self.pixels = self._planes(image)
@@ -126,6 +132,18 @@ class Target:
             self._places[region] = self.planes.places_on(region)
         return self._places[region]
 
+    def constant_error(self, region: Region | None = None) -> float:
+        """Return the mean squared error of the best image of one colour, over the valid pixels of a
+        region; 0 without any.
+        """
+        pixels = self.image()[self._valid_on(region)]
+        mean = pixels.sum(axis=0) / max(len(pixels), 1)
+        return float(np.square(pixels - mean).sum() / max(pixels.size, 1))
+
+    def _valid_on(self, region: Region | None) -> np.ndarray:
+        """Return the mask of the valid pixels [H, W] of a region."""
+        return valid_pixels(self._mask, self.shape) & (region is None or region.mask)
+
     def windows_on(self, region: Region | None) -> _Windows:
         """Return the windows that contain the pixels of a region, or all windows of the view for
         None.
@@ -137,7 +155,8 @@ class Target:
             (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(
                 windows, height, self.pixels
             )
-            self._windows[region] = _Windows(windows, count, pixels, mean, variance)
+            num_valid = max(3 * int(self._valid_on(region).sum()), 1)
+            self._windows[region] = _Windows(windows, count, pixels, num_valid, mean, variance)
         return self._windows[region]
 
     def masked(self, values: Float, places: UInt32 | None = None) -> Float:
@@ -171,15 +190,16 @@ class Recon(dr.CustomOp):
         arguments = (on.windows, height, image, target.pixels, on.mean, on.variance)
         derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
         arguments = (on.pixels, height, image, target.pixels, derivatives, scale)
-        (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
+        (gradient,), errors = recorded(_gradient_pass, planes.size, weight)(*arguments)
         structure = dr.opaque(mi.Float, on.count) - dr.sum(ssim)
-        loss = scale * ((1 - weight) * dr.sum(error) + weight * structure)
+        loss = scale * ((1 - weight) * dr.sum(errors.x) + weight * structure)
+        target.mse = dr.sum(errors.y) * dr.opaque(mi.Float, 1 / on.num_valid)
         if places is None:
             self.gradient = planes.image(target.masked(gradient))
         else:
             gradient = dr.gather(mi.Float, gradient, places, active=valid)
             self.gradient = target.masked(gradient, places)
-        dr.eval(self.gradient, loss)
+        dr.eval(self.gradient, loss, target.mse)
         return loss
 
     def backward(self) -> None:
@@ -198,11 +218,11 @@ def _statistics_pass(
         y = read(target)
         return [y, [v * v for v in y]]
 
-    def statistics(read: _Read, means: _Rows) -> tuple[_Rows, list[Float]]:
+    def statistics(read: _Read, means: _Rows) -> tuple[_Rows, list[Jit]]:
         mean, square = means
         return [mean, [dr.fma(-m, m, s) for m, s in zip(mean, square, strict=True)]], mean
 
-    return _walk(size, lanes, height, moments, statistics, 2, 2)
+    return _walk(size, lanes, height, moments, statistics, 2, 2, mi.Float(0))
 
 
 def _similarity_pass(
@@ -223,14 +243,14 @@ def _similarity_pass(
         y = read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
-    def similarity(read: _Read, means: _Rows) -> tuple[_Rows, list[Float]]:
+    def similarity(read: _Read, means: _Rows) -> tuple[_Rows, list[Jit]]:
         terms = [
             _similarity(*values) for values in zip(*means, read(mean), read(variance), strict=True)
         ]
         ssim, *derivatives = map(list, zip(*terms, strict=True))
         return derivatives, ssim
 
-    return _walk(size, lanes, height, products, similarity, 3, 3)
+    return _walk(size, lanes, height, products, similarity, 3, 3, mi.Float(0))
 
 
 def _similarity(
@@ -258,13 +278,13 @@ def _gradient_pass(
     target: Float,
     derivatives: list[Float],
     scale: Float,
-) -> tuple[list[Float], Float]:
-    """Return the planes of dL/dx, and the sum of |x - y| over each run."""
+) -> tuple[list[Float], Jit]:
+    """Return the planes of dL/dx, and the sums of |x - y| and (x - y)^2 over each run."""
 
     def unchanged(read: _Read) -> _Rows:
         return [read(plane) for plane in derivatives]
 
-    def gradient(read: _Read, means: _Rows) -> tuple[_Rows, list[Float]]:
+    def gradient(read: _Read, means: _Rows) -> tuple[_Rows, list[Jit]]:
         row = []
         errors = []
         for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *means, strict=True):
@@ -272,10 +292,10 @@ def _gradient_pass(
             structure = dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
             sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
             row.append(scale * ((1 - weight) * sign - weight * structure))
-            errors.append(dr.abs(error))
+            errors.append(mi.Vector2f(dr.abs(error), dr.square(error)))
         return [row], errors
 
-    return _walk(size, lanes, height, unchanged, gradient, 3, 1)
+    return _walk(size, lanes, height, unchanged, gradient, 3, 1, mi.Vector2f(0))
 
 
 def _walk(
@@ -283,10 +303,11 @@ def _walk(
     lanes: Lanes,
     height: Int32,
     across: Callable[[_Read], _Rows],
-    finish: Callable[[_Read, _Rows], tuple[_Rows, list[Float]]],
+    finish: Callable[[_Read, _Rows], tuple[_Rows, list[Jit]]],
     inputs: int,
     outputs: int,
-) -> tuple[list[Float], Float]:
+    total: Jit,
+) -> tuple[list[Float], Jit]:
     """Walk down the runs with a window: blur the rows that `across` returns, and write those that
     `finish` returns.
 
@@ -299,6 +320,7 @@ def _walk(
             to sum).
         inputs: number of rows to blur.
         outputs: number of rows to write.
+        total: 0, of the type of the numbers to sum.
 
     Returns:
         The planes that were written, defined on the runs, and the sum over the pixels of each run.
@@ -359,7 +381,7 @@ def _walk(
 
     windows = [packet([mi.Float(0) for _ in range(inputs * STRIP)]) for _ in range(2 * RADIUS)]
     end = on_aligned_stack(lanes.end)
-    state = (lanes.first - RADIUS, windows, mi.Float(0), targets)
+    state = (lanes.first - RADIUS, windows, total, targets)
     *_, total, targets = dr.while_loop(
         state, lambda row, *_: row < end + RADIUS, body, label="window"
     )

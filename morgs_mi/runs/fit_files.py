@@ -26,6 +26,7 @@ from reprlib import repr as shortened
 from typing import Any, NamedTuple
 
 import mitsuba as mi
+import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.fingerprint import fingerprint
@@ -411,6 +412,7 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
             values = {
                 "seconds": float(row["seconds"]),
                 "status": "" + row["status"],  # a TypeError unless it is a string
+                "psnr": float(np.float64(row.get("psnr"))),
                 "missing_views": tuple(row["missing_views"]),
                 "fingerprints": tuple(row.get("fingerprints", ())),
                 "exposures": tuple(

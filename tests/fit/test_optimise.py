@@ -8,7 +8,9 @@ import pytest
 from morgs_mi.fit.optimise import (
     Steps,
     adam,
+    fit_problem,
     optimise,
+    pop_psnr,
     replace_parameter,
     select_rows,
     values_of,
@@ -75,6 +77,28 @@ def test_optimise__names_losses_that_are_not_finite():
             lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)},
             Steps([0] * 3),
         )
+
+
+def test_pop_psnr__takes_the_squared_error_out_of_the_losses():
+    losses = {"recon": 0.1, "mse": 0.01}
+    assert pop_psnr(losses) == pytest.approx(20)
+    assert losses == {"recon": 0.1}
+    assert np.isnan(pop_psnr(losses))
+
+
+@pytest.mark.parametrize(
+    ("psnr", "errors", "start"),
+    [
+        (10.0, [0.01, 0.09], "the training views have 10.0 dB, worse than constant images with 13"),
+        (14.0, [0.01, 0.09], ""),
+        (21.0, [1e-4], ""),  # what changes may have one colour
+        (np.nan, [], ""),
+    ],
+)
+def test_fit_problem__names_images_that_are_worse_than_constant_ones(psnr, errors, start):
+    sentence = fit_problem(psnr, errors)
+    assert sentence.startswith(start)
+    assert bool(sentence) == bool(start)
 
 
 def test_optimise__continues_where_it_ended():

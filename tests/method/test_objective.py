@@ -191,7 +191,12 @@ def test_objective_config__refuses_terms_where_none_is_registered(registry):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("flow", "which the objective has already"), ("speed", "a new name"), ("a:b", "colon")],
+    [
+        ("flow", "which the objective has already"),
+        ("mse", "which the objective has already"),
+        ("speed", "a new name"),
+        ("a:b", "colon"),
+    ],
 )
 def test_loss_term__refuses_names(registry, name, message):
     loss_term("speed")(lambda p, o, config: 0)

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from math import ceil
 from pathlib import Path
 
@@ -22,11 +22,13 @@ from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import read_json
+from morgs_mi.core.files import write_json
 from morgs_mi.fit.fit_config import ShortFitConfig
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next
 from morgs_mi.runs.fit_files import Recording as Files
-from morgs_mi.runs.fit_files import stream_metadata
+from morgs_mi.runs.fit_files import read_reports, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
@@ -446,6 +448,17 @@ def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path):
     ):
         stream_capture(recording(), out, CONFIG)
     assert (capture / "capture.json").read_text() == "{}"
+
+
+def test_read_reports__reads_frames_without_a_psnr(tmp_path):
+    report = FrameReport(0, 1.0, 100, {}, 10)
+    assert np.isnan(report.psnr)
+    row = asdict(report)
+    old_row = {name: value for name, value in row.items() if name != "psnr"}
+    write_json(tmp_path / "report.json", {"frames": [row, {**old_row, "frame": 1}]})
+    assert read_json(tmp_path / "report.json")["frames"][0]["psnr"] is None
+    reports = read_reports(tmp_path / "report.json", range(2))
+    assert [np.isnan(read.psnr) for read in reports] == [True, True]
 
 
 def test_with_next__yields_the_frames_before_one_that_cannot_be_read():

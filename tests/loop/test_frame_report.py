@@ -1,0 +1,53 @@
+"""The report of a frame: the PSNR of its training views, and what the status names."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.fit.fit_config import LearningRates
+from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.stream_loop import StreamLoop
+from tests.quick import quick
+from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, views
+
+QUICK = quick(num_gaussians=200, first_frame_steps=40, epochs=3, dropout=0.0)
+POINTS = ball(200).numpy()["means"], np.full((200, 3), 0.5)
+
+
+def images(frame=0):
+    """Return the images of a ball that moves from frame to frame."""
+    truth = opaque_ball()
+    means = truth.numpy()["means"] + np.float32([0.1 * frame, 0, 0])
+    return bytes_of(images_of(replace(truth, means=means)))
+
+
+def scaled(rates, factor):
+    return LearningRates(**{name: factor * rate for name, rate in asdict(rates).items()})
+
+
+def test_push__reports_the_psnr_of_the_training_views():
+    loop = StreamLoop(views(), *POINTS, QUICK)
+    reports = [loop.push(images(0))[1]]
+    recorded = [View(*view) for view in zip(views(), images(0), strict=True)]
+    expected = mean_psnr(loop.gaussians, recorded, RenderConfig())
+    assert reports[0].psnr == pytest.approx(expected, abs=1)
+    reports += [loop.push(images(frame))[1] for frame in (0, 1)]
+    assert [report.status for report in reports] == 3 * ["ok"]
+    assert np.isnan(reports[1].psnr), "nothing changes"
+    assert reports[2].psnr > 15, "of the pixels that change"
+    assert "mse" not in reports[2].losses
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_push__status_names_a_fit_that_diverged(frame):
+    name = ("first_frame_rates", "rates")[frame]
+    fit = replace(QUICK.fit, **{name: scaled(getattr(QUICK.fit, name), 300)})
+    loop = StreamLoop(views(), *POINTS, replace(QUICK, fit=fit))
+    reports = [loop.push(images(index))[1] for index in range(frame + 1)]
+    assert [report.status for report in reports[:-1]] == frame * ["ok"]
+    status = reports[-1].status
+    assert (
+        f"the training views have {reports[-1].psnr:.1f} dB, worse than constant images" in status
+    )
