@@ -52,6 +52,9 @@ _LOG = logging.getLogger(__name__)
 # Growth of the resident memory after which releasing it pays: the next frame allocates its buffers
 # again.
 _GROWTH = 1.1
+# Fraction of the most active pixels since memory was released, below which it is released again: at
+# most once each time that the changes halve.
+_SHRINKAGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +232,10 @@ class StreamLoop:
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
         self._resident = 0  # bytes, before memory was last released
+        # Fractions of the pixels that were active in the last frame, and the most of all frames
+        # since memory was last released.
+        self._last_pixels = 0.0
+        self._most_pixels = 0.0
         # Whether images in a list may be in another order than the cameras.
         self._can_mistake_order = True
 
@@ -306,10 +313,17 @@ class StreamLoop:
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
         memory = process_memory()
+        pixels = report.active.get("pixels", 0.0)
+        recent_pixels = max(pixels, self._last_pixels)  # videos repeat single frames
+        self._last_pixels = pixels
+        self._most_pixels = max(pixels, self._most_pixels)
         # Buffers for more active Gaussians have a new size, and the smaller ones stay allocated.
-        # The buffers of the first frame are not used again.
-        if memory.get("resident", 0) > _GROWTH * self._resident:
-            self._resident = memory["resident"] if frame else 0
+        # The buffers of the first frame, and of frames that changed much more, are not used again.
+        resident = memory.get("resident", 0)
+        has_grown = resident > _GROWTH * self._resident
+        if has_grown or recent_pixels < _SHRINKAGE * self._most_pixels:
+            self._resident = max(resident, self._resident) if frame else 0
+            self._most_pixels = recent_pixels
             release_memory()
             memory = process_memory()
         return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)

@@ -70,6 +70,23 @@ def test_push__returns_memory_that_is_freed_to_the_system():
         assert memory["peak"] - memory["resident"] > 3e8
 
 
+def test_push__returns_the_buffers_of_frames_that_changed_more():
+    """After two still ones; a single one keeps them, because videos repeat frames."""
+    loop = StreamLoop(rig()[:2], (), (), quick())
+    rng = np.random.default_rng(0)
+    shape = rig()[0].height, rig()[0].width, 3
+    first, *others = rng.integers(0, 256, (4, *shape), np.uint8)
+
+    allocated = []
+    for image in (first, *others, others[-1], others[0], *[others[-1]] * 3):
+        loop.push([image, image])
+        # Without anything in use, what Dr.Jit has for later.
+        dr.detail.malloc_clear_statistics()
+        allocated.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM))
+    changed, single, again, two = (allocated[k] for k in (3, 4, 6, 8))
+    assert (single, two < 0.1 * again) == (changed, True), allocated
+
+
 def test_check_memory__names_what_is_needed_and_free(monkeypatch):
     monkeypatch.setattr("morgs_mi.core.memory.free_memory", lambda: 2e9)
     check_memory("f()", 1.9e9, "an image", "make it smaller")
