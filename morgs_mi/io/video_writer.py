@@ -21,7 +21,7 @@ H264 = "libx264"
 VP9 = "libvpx-vp9"
 """Encoder of videos in .webm, which browsers open."""
 # Constant quality: the demo's video side_by_side.mp4 has 35.2 dB in 25 kB a frame as H.264, 34.3 dB
-# in 15 kB as VP9, which takes three times as long.
+# in 15 kB as VP9, which takes two to three times as long.
 _OPTIONS = {
     H264: {"crf": "20"},
     VP9: {"crf": "24", "b": "0", "cpu-used": "4", "row-mt": "1"},
