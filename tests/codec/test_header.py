@@ -143,10 +143,10 @@ def test_header__images_are_decoded_where_they_are_drawn():
 def test_png_image__takes_no_memory_for_chunks_that_are_not_there(length, name):
     file = png_bytes(FITTING)
     image = PngImage(file[:33] + struct.pack(">I", length) + name + file[33:])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match="expected a PNG image, got a broken file"):
         image.pixels  # noqa: B018 (it decodes)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000, "kB"
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 100_000, "kB"
     assert_array_equal(PngImage(file + b"more").pixels, FITTING)
 
 

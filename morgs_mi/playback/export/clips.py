@@ -225,15 +225,17 @@ def named_path(
     check_number("named_path()", "least_seconds", least_seconds, "[0, inf)")
     clip = len(frame_numbers(stream)) / stream.fps
     clip *= max(1, math.ceil(least_seconds / clip - 1e-9))
+    # An image is behind the Gaussians in the view of its camera alone.
+    cameras = [replace(camera, background=None) for camera in stream.cameras]
     if name == "between":
-        return through_cameras(stream.cameras, clip)
+        return through_cameras(cameras, clip)
     if name == "orbit":
         if degrees is None and stream.metadata.get(DEFAULT_RIG) is True:
             degrees = _SWING
         means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
-        return orbit(stream.cameras, focus(stream.cameras, means), degrees, clip)
+        return orbit(cameras, focus(cameras, means), degrees, clip)
     origin = stream_origin(stream)
-    path = load_path(name, moved(stream.cameras, -origin))
+    path = load_path(name, moved(cameras, -origin))
     return replace(path, keys=moved(path.keys, origin))
 
 

@@ -1,6 +1,7 @@
 """`morgs-mi export` and `render`: one file per frame and videos, through the command line."""
 
 import json
+from dataclasses import replace
 
 import av
 import mitsuba as mi
@@ -61,6 +62,18 @@ def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
     assert "relative to the origin (500000, 5300000, 0)" in capsys.readouterr().out
     write_web_folder(stream, tmp_path / "web")
     assert StreamReader(tmp_path / "web/stream.morgs").metadata["origin"] == metadata["origin"]
+
+
+@pytest.mark.parametrize("name", ["orbit", "between", "path.json"])
+def test_named_path__has_no_image_of_a_camera_behind_its_views(tmp_path, monkeypatch, name):
+    """A path in a file may claim any size, to which the image would be enlarged."""
+    monkeypatch.chdir(tmp_path)
+    keys = [{"time": time, "camera": "left"} for time in (0, 1)]
+    (tmp_path / "path.json").write_text(json.dumps({"width": 10**9, "height": 9, "keys": keys}))
+    cameras = [replace(c, background=np.zeros((c.height, c.width, 3))) for c in rig()]
+    write_stream(tmp_path / "stream.morgs", cameras=cameras)
+    path = named_path(StreamReader(tmp_path / "stream.morgs"), name)
+    assert {key.background for key in path.keys} == {None}
 
 
 @pytest.mark.parametrize(("kind", "name"), [("ply", "a.compressed.ply"), ("gltf", "a.glb")])
