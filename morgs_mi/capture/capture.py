@@ -142,6 +142,11 @@ class Capture:
         return tuple(i for i in range(len(self.cameras)) if i not in self.test_views)
 
     @property
+    def place(self) -> str:
+        """Path of the first camera's clip in the capture."""
+        return os.path.relpath(self._sources[0].reader.path, self.path)
+
+    @property
     def reference_view(self) -> int:
         """Index of the first held-out camera, otherwise of the first camera: the one that figures
         show.

@@ -32,7 +32,7 @@ def test_info__lists_the_cameras_of_a_capture(capture, run):
     status, out, _ = run("info", capture, "--no-check")
     assert status == 0
     assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
-    assert f"{FRAMES} frames at 25 fps, 150 points, without ground truth." in out
+    assert f"{FRAMES} frames at 25 fps ({NAMES[0]}: {NAMES[0]}.mkv), 150 points, without ground truth." in out
     assert "COLMAP" in out
     assert "Reprojection" not in out
 
@@ -71,7 +71,7 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture, tmp_path, ru
     times = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
     status, out, _ = run("info", path, "--plot", plot)
     assert status == 0
-    assert "1 frame at 30 fps, without points (" in out
+    assert "1 frame at 30 fps (" in out
     assert out.startswith("Views between the cameras will be good: 5 cameras, 7 degrees apart")
     assert "\nReprojection check: median 0.0" in out
     assert "in 15 pairs; the poses fit the images." in out

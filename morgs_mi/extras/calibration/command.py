@@ -114,7 +114,8 @@ class Info:
                 print_result(line)
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(
-            f"{quantity(capture.num_frames, 'frame')} at {capture.fps:g} fps, {points}, {truth}."
+            f"{quantity(capture.num_frames, 'frame')} at {capture.fps:g} fps "
+            f"({capture.names[0]}: {capture.place}), {points}, {truth}."
         )
         for note in capture.notes:
             print_result(note)
