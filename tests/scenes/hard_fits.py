@@ -1,17 +1,19 @@
-"""Recordings that are hard to reconstruct: noise for hundreds of frames, exposures that differ by
-1000, too few cameras, and nothing to see.
+"""Recordings and settings that are hard: noise for hundreds of frames, exposures that differ by
+1000, light of 1e5, images of one pixel, too few cameras, nothing to see, and rates that diverge.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from morgs_mi import Camera, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.fit.fit_config import LearningRates
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.quick import NO_DENSITY, quick
@@ -40,6 +42,9 @@ class HardFit:
         num_frames: of the recording.
         psnr: which the first and the last frame exceed in the first view, dB.
         textured: whether the scene has a texture.
+        config: settings of the fit.
+        shift: from the scene to the points that the fit starts from.
+        status: word of the status of a frame; "ok" if all frames have this status.
     """
 
     name: str
@@ -48,6 +53,9 @@ class HardFit:
     num_frames: int = 4
     psnr: float = 20.0
     textured: bool = True
+    config: StreamConfig = CONFIG
+    shift: tuple[float, ...] = (0.0, 0.0, 0.0)
+    status: str = "ok"
 
 
 def scene(textured):
@@ -73,17 +81,54 @@ def bracketed(images, frame):
     return eight_bits([encode_light(light) for light in lights])
 
 
+def noise(images, frame):
+    rng = np.random.default_rng(frame)
+    return [rng.integers(0, 256, image.shape, np.uint8) for image in images]
+
+
+def rig_of(width, height):
+    return tuple(look_at_cameras(QUAD, 50, width, height))
+
+
+def plain(images, frame):
+    """Return the true images, the same in all frames."""
+    return eight_bits(images)
+
+
+def with_a_black_frame(images, frame):
+    return eight_bits([image * (frame != 2) for image in images])
+
+
+def blinding(images, frame):
+    """Return images of linear light up to 1e5."""
+    return [np.float32(1e5 * decode_light(image)) for image in images]
+
+
+FEW = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=20))
+LONG = replace(CONFIG, fit=replace(CONFIG.fit, first_frame_steps=2000))
+_RATES = {name: 100 * rate for name, rate in asdict(CONFIG.fit.first_frame_rates).items()}
+DIVERGING = replace(
+    CONFIG, fit=replace(CONFIG.fit, first_frame_rates=LearningRates(**_RATES))
+)
 HARD_FITS = [
     HardFit("still, noise of 0.03", RIG, lambda images, t: eight_bits(images, 0.03, t), 300),
+    HardFit("120 still frames", RIG, plain, 120),
+    HardFit("a black frame in mid-stream", RIG, with_a_black_frame, 5, status="black"),
+    HardFit("noise alone", RIG, noise, psnr=0.0),
     HardFit("exposures 1:1000", RIG, bracketed, psnr=10.0),
-    HardFit("one camera", RIG[:1], lambda images, t: eight_bits(images)),
+    HardFit("light up to 1e5", RIG, blinding, psnr=0.0),
+    HardFit("one camera", RIG[:1], plain),
     HardFit(
         "two equal cameras",
         (RIG[0], replace(RIG[0], name="again")),
-        lambda images, t: eight_bits(images),
+        plain,
     ),
-    HardFit("no texture", RIG, lambda images, t: eight_bits(images), textured=False),
+    HardFit("no texture", RIG, plain, textured=False),
     HardFit("black", RIG, lambda images, t: [np.zeros((36, 48, 3), np.uint8) for _ in images]),
+    HardFit("images of 1x1", rig_of(1, 1), plain, config=FEW),
+    HardFit("2,000 steps on 8x6", rig_of(8, 6), plain, config=LONG),
+    HardFit("points that no camera sees", RIG, plain, shift=(0.0, 0.0, 500.0), psnr=0.0),
+    HardFit("rates x 100", RIG, plain, psnr=0.0, config=DIVERGING, status="worse than constant"),
 ]
 
 
@@ -99,7 +144,8 @@ def fitted(fit, num_frames=None):
     if fit.name == "black":
         images = [0 * image for image in images]
     raw = truth.numpy()
-    loop = StreamLoop(fit.cameras, raw["means"], np.full((200, 3), 0.5), CONFIG)
+    points = raw["means"] + np.float32(fit.shift)
+    loop = StreamLoop(fit.cameras, points, np.full((200, 3), 0.5), fit.config)
     for frame in range(num_frames or fit.num_frames):
         _, report = loop.push(fit.recorded(images, frame))
         color = np.asarray(rasterize(loop.gaussians, fit.cameras[0], ("color",)).color)
