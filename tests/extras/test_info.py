@@ -32,7 +32,8 @@ def test_info__lists_the_cameras_of_a_capture(capture, run):
     status, out, _ = run("info", capture, "--no-check")
     assert status == 0
     assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
-    assert f"{FRAMES} frames at 25 fps ({NAMES[0]}: {NAMES[0]}.mkv), 150 points, without ground truth." in out
+    place = f"{NAMES[0]}: {NAMES[0]}.mkv"
+    assert f"{FRAMES} frames at 25 fps ({place}), 150 points, without ground truth." in out
     assert "COLMAP" in out
     assert "Reprojection" not in out
 

@@ -107,9 +107,7 @@ def blinding(images, frame):
 FEW = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=20))
 LONG = replace(CONFIG, fit=replace(CONFIG.fit, first_frame_steps=2000))
 _RATES = {name: 100 * rate for name, rate in asdict(CONFIG.fit.first_frame_rates).items()}
-DIVERGING = replace(
-    CONFIG, fit=replace(CONFIG.fit, first_frame_rates=LearningRates(**_RATES))
-)
+DIVERGING = replace(CONFIG, fit=replace(CONFIG.fit, first_frame_rates=LearningRates(**_RATES)))
 HARD_FITS = [
     HardFit("still, noise of 0.03", RIG, lambda images, t: eight_bits(images, 0.03, t), 300),
     HardFit("120 still frames", RIG, plain, 120),
