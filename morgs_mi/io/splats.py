@@ -36,6 +36,7 @@ _WORDS = {
 _MOST_NAMED = 3
 
 
+@np.errstate(invalid="ignore")  # of NaN that signal, which a damaged file may have
 def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float) -> Gaussians:
     """Return the Gaussians of a file without the invalid ones, with a warning that names them.
 

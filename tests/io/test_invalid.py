@@ -26,12 +26,14 @@ def broken(name, value, rows):
     return replace(splats(N), **{name: values})
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("means", np.nan),
         ("log_scales", 1e30),
         ("quats", np.inf),
+        ("quats", np.uint32(0x7FA00000).view(np.float32)),  # a NaN that signals
         ("logit_opacities", np.nan),
         ("sh_coeffs", np.inf),
     ],
