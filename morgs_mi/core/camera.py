@@ -103,7 +103,15 @@ class Camera:
             require(shape == (4, 4), where, "`viewmat` must be [4, 4]", shape, "pass one camera's")
         else:
             viewmat = rigid(f"{where}, `viewmat`", numbers(where, "viewmat", viewmat, 4, 4))
-        if self.background is not None and not isinstance(self.background, PngImage):
+        if isinstance(self.background, PngImage):
+            require(
+                self.background.size == self.size,
+                where,
+                f"`background` must be a PNG file of {self.width}x{self.height} pixels",
+                "one of {}x{}".format(*self.background.size),
+                "use the camera of that size",
+            )
+        elif self.background is not None:
             image = numbers(where, "background", self.background, self.height, self.width, 3)
             values = unit_values(image, np.float32)
             require(

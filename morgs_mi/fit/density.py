@@ -33,6 +33,7 @@ from morgs_mi.core.checks import (
     check_number,
     check_type,
     errors_at,
+    few,
     numbers,
     require,
 )
@@ -313,10 +314,8 @@ class DensityControl:
             list(scores.shape),
             "observe the Gaussians that the optimiser has now",
         )
-        is_finite = np.isfinite(scores)
-        index = int(is_finite.argmin())
-        value = f"{scores[index]} at {index}"
-        require(is_finite[index], place, "`scores` must be finite", value, "set other scores")
+        others = scores[~np.isfinite(scores)]
+        require(not len(others), place, "`scores` must be finite", few(others), "set other scores")
         self.scores = None
         return scores
 

@@ -90,8 +90,8 @@ def test_density_control__refuses_absurd_births(births):
 @pytest.mark.parametrize(
     ("scores", "message"),
     [
-        ([1, np.nan, 0], "`scores` must be finite, got nan at 1"),
-        ([1, 0, -np.inf], "`scores` must be finite, got -inf at 2"),
+        ([1, np.nan, 0], "`scores` must be finite, got nan; set"),
+        ([1, 0, -np.inf], "`scores` must be finite, got -inf; set"),
         (["a", "b", "c"], "`scores` must be an array of real numbers, got"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, RenderConfig, StreamLoop, fit_gaussians, rasterize
+from morgs_mi.core.png import PngImage, png_bytes
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.render.active_view import ActiveView, ViewGroup
 from morgs_mi.render.region import Region
@@ -82,6 +83,8 @@ def test_camera__resizes_and_refuses_backgrounds():
         replace(CAMERA, background=np.full((H, W, 3), np.nan))
     with pytest.raises(ValueError, match="`background` must have numbers from -32 to 32, 1 for wh"):
         replace(CAMERA, background=np.full((H, W, 3), 1e11))
+    with pytest.raises(ValueError, match=r"`background` must be a PNG file of 48x33 .* of 3x2"):
+        replace(CAMERA, background=PngImage(png_bytes(np.zeros((2, 3, 3), np.uint8))))
 
 
 @pytest.mark.parametrize(
