@@ -225,14 +225,14 @@ def _notes_of_clips(names: Sequence[str], readers: Sequence[FrameReader]) -> lis
 def _time_codes(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
     """Return a sentence if overlapping clips began at different times by their time codes."""
     fps, starts, counts = np.array([(r.fps, r.start, r.num_frames) for r in readers], float).T
-    apart = np.ptp(starts)
+    spread = np.ptp(starts)
     offsets = np.rint((starts[0] - starts) * fps)
     # Comparisons are false if a time code or a rate is unknown.
-    if not (offsets.any() and apart < (counts / fps).min()):
+    if not (offsets.any() and spread < (counts / fps).min()):
         return []
     options = " ".join(f"{names[c]} {offsets[c]:g}" for c in np.flatnonzero(offsets).tolist())
     return [
-        f"The time codes of the clips begin up to {apart:.3g} s apart; if they were synchronised, "
+        f"The time codes of the clips begin up to {spread:.3g} s apart; if they were synchronised, "
         f"align the clips with --offset {options}."
     ]
 

@@ -159,7 +159,7 @@ class Accuracy:
     tolerance: float  #: Largest error of the image and of every gradient.
     cameras: int  #: Number of cameras.
     config: RenderConfig | None  #: The chosen one, see `chosen`; None if there is none.
-    given: RenderConfig  #: The configuration whose settings are varied.
+    base: RenderConfig  #: The configuration whose settings are varied.
 
     @property
     def sentence(self) -> str:
@@ -232,7 +232,7 @@ class Accuracy:
                 color = line.get_color()
                 axes.annotate(name, end, (6, -3), textcoords="offset points", color=color)
                 for row, *point in zip(rows, seconds, errors, strict=True):
-                    if row.config == self.given:
+                    if row.config == self.base:
                         axes.plot(*point, "ko", markersize=11, fillstyle="none")
         for axes, title in zip(panels, ("image", "worst gradient"), strict=True):
             axes.axhline(self.tolerance, color="0.8", linestyle=":")
@@ -335,7 +335,8 @@ def accuracy(
     rng = np.random.default_rng(0)
     # An alpha below 1e-12 changes no float32 image.
     exact = replace(config, alpha_min=1e-12)
-    choosing, checking = [], []
+    choosing: list[_Sample] = []
+    checking: list[_Sample] = []
     for k, view in enumerate(views):
         alpha = np.array(rasterize(gaussians, view, ("alpha",), config=config).alpha)
         shown = rng.permutation(np.flatnonzero(alpha))[:_PIXELS]
@@ -377,9 +378,9 @@ def accuracy(
             errors[name].append(sample.errors(np.array(image), list(map(np.array, gradients))))
     rows = []
     for name, setting in configs.items():
-        chosen_by, checked_by = errors[name][: len(views)], errors[name][len(views) :]
-        largest = {key: max(e[key] for e in chosen_by) for key in chosen_by[0]}
-        checked = max(max(e.values()) for e in checked_by)
+        choosing_errors = errors[name][: len(views)]
+        largest = {key: max(e[key] for e in choosing_errors) for key in choosing_errors[0]}
+        checked = max(max(e.values()) for e in errors[name][len(views) :])
         time_of_image = float(np.median(seconds[name][1:], axis=0).mean())
         rows.append(Setting(name, setting, time_of_image, largest, checked))
     choice = chosen(rows, tolerance)
