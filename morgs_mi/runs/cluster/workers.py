@@ -7,6 +7,7 @@ with the same result.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import platform
@@ -86,6 +87,9 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
+        # A client that found no scheduler ends when it is collected, which waits forever for a lock
+        # if it happens while another one begins.
+        gc.collect()
         address: Any = scheduler
         if scheduler is None:
             # These processes run `python -c`, which would import modules of the current folder.
