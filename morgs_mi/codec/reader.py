@@ -322,8 +322,8 @@ class StreamReader(FrameSource):
     def _sentence(self, number: int, at: int, problem: str, last: int | None = None) -> str:
         """Return the message of a problem; `last` is the frame of the packet before it."""
         frames = "" if last is None else f", up to frame {last}"
-        before = quantity(number, "packet")
-        return f"{self._place(number, at)}: {problem}; {before} before it can be read{frames}."
+        packets = quantity(number, "packet")
+        return f"{self._place(number, at)}: {problem}; {packets} before it can be read{frames}."
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"

@@ -26,6 +26,7 @@ import numpy as np
 
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.checks import errors_at
+from morgs_mi.core.png import has_whole_chunks
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import clock, time_code_seconds, true_rate
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
@@ -339,11 +340,11 @@ def _unused_properties(
     """Yield a sentence for each property of a video that is not used: other tracks, interlaced
     rows, and colours other than sRGB's.
     """
-    used, *others = (
+    first, *others = (
         track.metadata.get("title") or track.codec.name for track in _tracks(container)
     )
     if others:
-        yield f"the first video track, {used}, is used, and not {', '.join(others)}."
+        yield f"the first video track, {first}, is used, and not {', '.join(others)}."
     if frame.interlaced_frame:
         yield (
             "interlaced: each frame has the rows of two moments; deinterlace the clip (FFmpeg's "
@@ -632,14 +633,18 @@ def decode_image(file: Path, mode: int) -> np.ndarray:
         mode: of `cv2.imdecode`.
 
     Raises:
-        ValueError: it is no image, or claims more pixels than the file may hold.
+        ValueError: it is no image, is a truncated PNG, or claims more pixels than the file may
+            hold.
     """
     data = np.fromfile(file, np.uint8)
     width, height = imagesize.get(file)  # -1 where the header does not show it
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
-    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    is_png = data[:4].tobytes() == b"\x89PNG"
+    is_whole = has_whole_chunks(data.tobytes()) if is_png else len(data) > 0
+    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if is_whole else None
     if image is None:
         raise ValueError(
-            f"{file}: expected an image, got {len(data)} bytes of another kind; copy it again."
+            f"{file}: expected an image, got {len(data)} bytes that are none or a part of one; copy "
+            "it again."
         )
     return image

@@ -31,3 +31,13 @@ def test_folder_reader__masks_transparent_pixels_of_every_format(tmp_path, suffi
     mask, note = opaque_pixels(FolderReader.of_files([file]), "cam")
     assert "cam" in note
     assert_array_equal(mask, RGBA[..., 3] == 255)
+
+
+def test_folder_reader__decodes_no_png_whose_chunks_claim_more_than_the_file(tmp_path):
+    """OpenCV would allocate the claimed length, up to 4 GB."""
+    data = bytearray(cv2.imencode(".png", RGB)[1].tobytes())
+    at = data.find(b"IDAT") - 4
+    data[at : at + 4] = b"\x7f\xff\xff\xff"
+    (tmp_path / "0.png").write_bytes(data)
+    with pytest.raises(ValueError, match=r"0.png: expected an image, got \d+ bytes that are none"):
+        FolderReader.of_files([tmp_path / "0.png"])

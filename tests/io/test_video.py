@@ -292,7 +292,9 @@ def write_tracks(path, tracks):
     with av.open(str(path), "w") as container:
         streams = [container.add_stream("ffv1", rate=25) for _ in tracks]
         for stream, title in zip(streams, tracks, strict=True):
-            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "bgr0"
+            stream.width = WIDTH
+            stream.height = HEIGHT
+            stream.pix_fmt = "bgr0"
             stream.metadata["title"] = title
         for t in range(COUNT):
             for stream, value in zip(streams, tracks.values(), strict=True):

@@ -1,6 +1,5 @@
 """Workers: what they run, what happens when they die, and the sentences of what cannot be."""
 
-import gc
 import os
 import signal
 import subprocess
@@ -99,9 +98,6 @@ def test_open_client__refuses_in_one_sentence(monkeypatch):
         message = f"{scheduler}: expected a scheduler with workers, got none"
         with pytest.raises((ValueError, ConnectionError), match=message), open_client(scheduler):
             pass
-        # Dask ends a client that was refused when it is collected. While the next one starts, both
-        # would wait for the same lock.
-        gc.collect()
 
 
 def test_open_client__names_the_extra_that_is_missing(monkeypatch):
