@@ -644,7 +644,7 @@ def decode_image(file: Path, mode: int) -> np.ndarray:
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if is_whole else None
     if image is None:
         raise ValueError(
-            f"{file}: expected an image, got {len(data)} bytes that are none or a part of one; copy "
-            "it again."
+            f"{file}: expected an image, got {len(data)} bytes that are none, or a part of one; "
+            "copy it again."
         )
     return image
