@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations
 from typing import Any, TypeVar
 
 import numpy as np
@@ -50,7 +50,6 @@ _CAMERA_MISTAKES = (
 )
 # Every exchange of poses is compared with all matches, so their number is limited.
 _MAX_EXCHANGED = 12
-_MAX_PERMUTED = 4
 # Factors of the focal length that are tried, and their step: at a wrong focal length the error has
 # several minima.
 _FACTOR_OCTAVES = 2.0
@@ -69,15 +68,8 @@ def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return [(i, j) for i, j in np.argwhere(np.triu(same, 1)).tolist()]
 
 
-def rig_candidates(
-    capture: Capture, wrong: Sequence[int]
-) -> Iterator[tuple[Sequence[Camera], str]]:
-    """Yield the corrected cameras for each mistake that concerns several poses.
-
-    Args:
-        capture: the capture.
-        wrong: the views with poses that do not fit; their order may be wrong.
-    """
+def rig_candidates(capture: Capture) -> Iterator[tuple[Sequence[Camera], str]]:
+    """Yield the corrected cameras of a capture for each mistake that concerns several poses."""
     cameras = capture.cameras
     if capture.layout == poses_bounds.READER.name:
         alphabetical = sorted(capture.names)
@@ -115,15 +107,6 @@ def rig_candidates(
             rig[j] = cameras[i]
             names = f"{cameras[i].name} and {cameras[j].name}"
             yield rig, f"the clips of {names}, or their poses, seem to be swapped; exchange them"
-    if 3 <= len(wrong) <= _MAX_PERMUTED:
-        for order in permutations(wrong):
-            rig = [*cameras]
-            sources = []
-            for view, source in zip(wrong, order, strict=True):
-                rig[view] = cameras[source]
-                sources.append(f"{cameras[view].name} has the pose of {cameras[source].name}")
-            names = ", ".join(sources)
-            yield rig, f"the poses seem to be in another order ({names}); reorder them"
 
 
 def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:

@@ -35,14 +35,16 @@ _SAME_IMAGE = 0.5
 # A correction must lower the error by this factor, and to less than twice the error of the poses
 # that fit or to this many pixels: among many candidates, a wrong one may be slightly better than
 # the given poses.
-_GAIN = 3.0
+_GAIN = 8.0
 _GOOD_ERROR = 0.5
 # Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not
 # more accurate.
 _SAMPLE = 40
 _FACTOR_PAIRS = 8
-# px. Width at which the first frame of a fit is checked, in about a second for 20 views.
+# px. Largest width at which the first frame of a fit is searched for features, in about a second
+# for 20 views, and the least one; errors are those at the largest.
 _WIDTH = 480
+_LEAST_WIDTH = 160
 _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the "
     "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
@@ -92,7 +94,9 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     group = pairs.agreeing()
     checks = [_check(view, pairs, group) for view in range(len(capture.cameras))]
     errors = np.concatenate([np.zeros(0), *pairs.errors])
-    correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
+    # Of so few matches, a wrong correction explains enough by chance.
+    has_many = 2 * len(errors) >= _MIN_MATCHES * len(checks)
+    correction = _correct_rig(capture, pairs.sampled(), checks) if has_many else None
     if correction:
         cameras, explanation = correction
         # The views with another corrected camera are wrong.
@@ -129,20 +133,25 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
 
 
 def pose_problems(views: Sequence[View]) -> list[str]:
-    """Return a sentence if poses are known not to fit the images of views, otherwise none."""
+    """Return a sentence if poses are known not to fit the images of views, which may be in another
+    order; otherwise none.
+    """
     cameras = []
     features = []
     for index, view in enumerate(views):
-        # Large errors, such as another order of the cameras, show in small images.
-        camera = view.camera.with_width(min(_WIDTH, view.camera.width))
-        image = cv2.resize(view.image, camera.size, interpolation=cv2.INTER_AREA)
-        features.append(detect(image, view.mask))
+        camera = view.camera.with_width(_WIDTH)
+        width = min(max(view.camera.width, _LEAST_WIDTH), _WIDTH)
+        size = (width, round(width * camera.height / _WIDTH))
+        own = detect(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), view.mask)
+        # In px of one size, as the limits of the errors are.
+        features.append(replace(own, points=own.points * camera.size / size))
         cameras.append(replace(camera, name=camera.name or f"view {index}"))
     none = np.zeros((0, 3))
     capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
     matches = match_views(features, cameras)
     check = check_rig(capture, SharedFeatures(tuple(features), tuple(matches)))
-    return [check.advice] if check.fits is False else []
+    order = "a list of images has the cameras' order, a dict their names"
+    return [f"{check.advice.rstrip('.')}; {order}."] if check.fits is False else []
 
 
 def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
@@ -271,8 +280,7 @@ def _correct_rig(
         lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
     )
     if error > _GOOD_ERROR:
-        wrong = [view for view, check in enumerate(checks) if check.fits is False]
-        candidates = [*rig_candidates(capture, wrong), *candidates]
+        candidates = [*rig_candidates(capture), *candidates]
     errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
     if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
         return candidates[int(np.argmin(errors))]

@@ -126,7 +126,7 @@ def with_images(shared, capture, order):
         (
             (0, 3, 1, 2, 4, 5),
             {1, 2, 3},
-            "in another order (cam1 has the pose of cam3, cam2 has the pose of cam1",
+            "the poses of cam1, cam2, cam3 do not fit the images",  # two at a time explain nothing
         ),
     ],
 )

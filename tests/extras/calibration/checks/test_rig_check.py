@@ -9,7 +9,12 @@ from numpy.testing import assert_array_equal
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.features import detect
 from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
-from morgs_mi.extras.calibration.checks.rig_check import check_rig
+from morgs_mi.extras.calibration.checks.rig_check import check_rig, pose_problems
+from morgs_mi.fit.view import View
+from morgs_mi.loop.first_frame import fit_gaussians
+from morgs_mi.stream_loop import StreamLoop
+from tests.quick import quick
+from tests.scenes import textured
 from tests.scenes.textured import turned, with_cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -104,3 +109,43 @@ def test_triangulate_points__matches_distant_views_with_their_poses(capture, sha
     assert len(points.points) > 50
     wrong = with_cameras(ends, lambda i, c: replace(c, viewmat=FLIP @ c.viewmat) if i else c)
     assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)
+
+
+SWAPPED = "the clips of view 1 and view 2, or their poses, seem to be swapped; exchange them"
+
+
+@pytest.mark.parametrize(
+    ("width", "order", "sentence"),
+    [
+        (96, (0, 1, 2, 3), None),
+        (48, (0, 1, 2, 3), None),
+        (96, (0, 2, 1, 3), SWAPPED),
+        (96, (3, 2, 1, 0), "the poses of view 0, view 1, view 2, view 3 do not fit the images"),
+        (320, (3, 0, 2, 1), "the poses of view 0, view 1, view 2, view 3 do not fit the images"),
+        (48, (1, 3, 0, 2), None),  # an exchange of two explains the few matches by chance
+    ],
+)
+def test_pose_problems__name_the_right_order_or_none(width, order, sentence):
+    cameras = [replace(camera, name="") for camera in textured.rig(4, width, 3 * width // 4)]
+    planes = textured.textures()
+    images = [textured.render(camera, planes) for camera in cameras]
+    views = [View(camera, images[k]) for camera, k in zip(cameras, order, strict=True)]
+    problems = pose_problems(views)
+    assert len(problems) == (sentence is not None)
+    for problem in problems:
+        assert sentence in problem
+        assert problem.endswith("; a list of images has the cameras' order, a dict their names.")
+
+
+def test_fit_gaussians__warns_of_images_in_another_order(caplog):
+    cameras = [replace(camera, name=f"cam{i}") for i, camera in enumerate(textured.rig(4, 96, 72))]
+    planes = textured.textures()
+    a, b, c, d = (textured.render(camera, planes) for camera in cameras)
+    points = textured.points(np.random.default_rng(0), 50)
+    named = dict(zip(("cam0", "cam2", "cam1", "cam3"), (a, c, b, d), strict=True))
+    for images, is_warned in (([a, b, c, d], False), ([a, c, b, d], True), (named, False)):
+        caplog.clear()
+        fit_gaussians(cameras, images, *points, quick())
+        StreamLoop(cameras, *points, quick()).push(images)
+        messages = [record.getMessage() for record in caplog.records]
+        assert sum("the poses do not fit the images" in text for text in messages) == 2 * is_warned
