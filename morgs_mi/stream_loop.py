@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,7 +21,6 @@ import numpy as np
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.extras import extra, places
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.memory import process_memory, release_memory
@@ -29,7 +28,12 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
-from morgs_mi.loop.first_frame import corrected, fitted_first_frame, with_first_confidence
+from morgs_mi.loop.first_frame import (
+    corrected,
+    fitted_first_frame,
+    warn_of_order,
+    with_first_confidence,
+)
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.input_images import Frame, as_array, image_status, in_order
 from morgs_mi.loop.observation import (
@@ -39,7 +43,6 @@ from morgs_mi.loop.observation import (
     extended_history,
     observe_frame,
     prepare,
-    views_of,
 )
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import find_active_set
@@ -298,11 +301,8 @@ class StreamLoop:
         if observation is None:
             observation = observe_frame(self.setup, frame, previous, images)
         history = observation.history
-        if not frame and self._can_mistake_order and not isinstance(images, Mapping):
-            for name in places("image checks"):
-                views = views_of(self.setup, history.images)
-                for problem in extra("image checks", name)(views):
-                    _LOG.warning("frame 0: %s", problem)
+        if not frame and self._can_mistake_order:
+            warn_of_order(self.setup, images, history.images)
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:  # beside the fit, which starts below

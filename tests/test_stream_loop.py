@@ -172,7 +172,7 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
     nothing = np.zeros((0, 3))
     loop = StreamLoop(cameras()[:4], nothing, nothing, with_fit(density=DensityConfig()))
     _, report = loop.push(clip[0][:4])
-    assert "0 points, too few: seeded 300" in report.status
+    assert "too few points (0): seeded 300" in report.status
     assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 

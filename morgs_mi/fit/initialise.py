@@ -28,6 +28,9 @@ MIN_POINTS = 20
 """Number of points below which Gaussians start from random ones."""
 # Number of points below which random ones are added where views show none.
 _MANY_POINTS = 1000
+# Share of the points that the cameras see, at least, and the number of points that are checked.
+_LEAST_SEEN = 0.05
+_CHECKED = 10_000
 # Rows and columns into which a view is divided to find where it shows no points.
 _CELLS = 8
 # Distance of random points from cameras with parallel axes, scene extents.
@@ -107,6 +110,22 @@ def initial_points(
         if not is_empty.all():
             points = points[0][~is_empty], points[1][~is_empty]
     return points
+
+
+def unseen_points(cameras: Sequence[Camera], points: np.ndarray) -> str:
+    """Return a sentence if hardly any of the points [P, 3] lies in a view; otherwise nothing, also
+    without points.
+    """
+    some = points[:: len(points) // _CHECKED + 1]
+    is_seen = np.zeros(len(some), bool)
+    for camera in cameras:
+        is_seen |= seen_points(camera, some)[0]
+    if is_seen.sum() >= _LEAST_SEEN * len(some):
+        return ""
+    return (
+        f"the cameras see {100 * is_seen.mean():.0f} % of the {len(points)} points, which are not "
+        "used: check their axes and units"
+    )
 
 
 def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:

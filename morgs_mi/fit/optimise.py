@@ -13,6 +13,7 @@ from drjit.opt import Adam
 
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Arrays, Tensor, Tensors
+from morgs_mi.fit.view import decibels
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.objective import SQUARED_ERROR
 from morgs_mi.render.kernel_recording import render_lock
@@ -163,11 +164,7 @@ def pop_psnr(losses: dict[str, float]) -> float:
     """Remove the mean squared error from the losses, and return its PSNR, dB; NaN if there is
     none.
     """
-    return _psnr(losses.pop(SQUARED_ERROR, np.nan))
-
-
-def _psnr(error: float) -> float:
-    return float(-10 * np.log10(np.maximum(error, 1e-10)))
+    return float(decibels(losses.pop(SQUARED_ERROR, np.nan)))
 
 
 def fit_problem(psnr: float, constant_errors: Iterable[float]) -> str:
@@ -179,7 +176,7 @@ def fit_problem(psnr: float, constant_errors: Iterable[float]) -> str:
     """
     if not psnr < _DOUBTFUL:
         return ""
-    constant_psnr = _psnr(float(np.mean([*constant_errors])))
+    constant_psnr = decibels(np.mean([*constant_errors]))
     if psnr >= constant_psnr:
         return ""
     return (

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import valid_pixels
@@ -21,6 +22,8 @@ chance.
 """
 
 MIN_SIDE = 32  # px, of a reduced image
+# Mean squared error of 100 dB.
+_LEAST_ERROR = 1e-10
 # Least width of views of half the size, px.
 COARSE_WIDTH = 160
 # Side of the withheld blocks, px.
@@ -103,4 +106,9 @@ def mean_psnr(gaussians: Gaussians, views: Sequence[View], render: RenderConfig)
             image = rendered(gaussians, view.camera, render, view.white)
             squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
             errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
-    return float((-10 * np.log10(np.maximum(errors, 1e-10))).mean()) if errors else np.nan
+    return float(np.mean(decibels(errors))) if errors else np.nan
+
+
+def decibels(error: ArrayLike) -> Any:
+    """Return the PSNR of a mean squared error, at most 100 dB."""
+    return -10 * np.log10(np.maximum(error, _LEAST_ERROR))

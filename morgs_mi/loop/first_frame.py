@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_type, numbers, quantity
+from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.config import config_or_default
+from morgs_mi.core.extras import extra, places
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -24,7 +25,7 @@ from morgs_mi.fit.balance import balance_cameras, short_fit_config
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.fit.initialise import MIN_POINTS, FirstFrameProblem
+from morgs_mi.fit.initialise import MIN_POINTS, FirstFrameProblem, unseen_points
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.input_images import Frame, Images
 from morgs_mi.loop.observation import (
@@ -96,8 +97,23 @@ def fit_gaussians(
             cameras = [replace(camera, background=behind[v]) for v, camera in enumerate(cameras)]
     setup = prepare(cameras, points, point_colors, config, masks)
     observed = observe_frame(setup, 0, ImageHistory(), images)
+    warn_of_order(setup, images, observed.history.images)
     packet, _ = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
     return decode(None, packet).gaussians
+
+
+def warn_of_order(setup: Setup, images: Frame, present: Images) -> None:
+    """Warn if images seem to be in another order than the cameras; in a dict they have names.
+
+    Args:
+        setup: data that all frames share.
+        images: of the first frame, as they were given.
+        present: those that exist as a display shows them, by view index.
+    """
+    if not isinstance(images, Mapping):
+        for name in places("image checks"):
+            for problem in extra("image checks", name)(views_of(setup, present)):
+                _LOG.warning("frame 0: %s", problem)
 
 
 def fitted_first_frame(
@@ -116,6 +132,10 @@ def fitted_first_frame(
     """
     begin = time.perf_counter()
     config = setup.config
+    problems = [unseen_points(setup.cameras, setup.points)]
+    if problems[0]:
+        none = np.zeros((0, 3))
+        setup = replace(setup, points=none, point_colors=none)
     on_round = _on_round(setup, on_provisional)
     exposures, exposure_entry = _balanced(setup, observed.encoded, progress, on_round)
     views = views_of(setup, corrected(observed.encoded, exposures))
@@ -125,11 +145,9 @@ def fitted_first_frame(
     problem = FirstFrameProblem.of(views, cloud, plan, config.render, rng)
     fit_config = adapted_to_images(plan, problem)
 
-    problem_of_points = ""
     if (count := len(setup.points)) < MIN_POINTS:
-        problem_of_points = (
-            f"the capture has {quantity(count, 'point')}, too few: seeded {plan.first_count} "
-            "random ones inside the views"
+        problems.append(
+            f"too few points ({count}): seeded {plan.first_count} random ones inside the views"
         )
     validation: dict[str, Any] = {}
     if len(views) > 1:
@@ -143,7 +161,7 @@ def fitted_first_frame(
     elif limit is not None:
         limit = max(limit - (time.perf_counter() - begin), 1.0)
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round, limit)
-    problems = list(filter(None, [problem_of_points, fitted.problem]))
+    problems = list(filter(None, [*problems, fitted.problem]))
     for sentence in problems:
         _LOG.warning("frame 0: %s", sentence)
     packet = keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -24,6 +25,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.fit.budget import check_capacity
+from morgs_mi.fit.initialise import unseen_points
 from morgs_mi.loop.first_frame import preview
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
@@ -40,6 +42,7 @@ from morgs_mi.runs.fit_files import (
 )
 from morgs_mi.stream_loop import StreamLoop
 
+_LOG = logging.getLogger(__name__)
 # Fewer points are replaced by triangulated ones, if there are more of those.
 _FEW_POINTS = 100
 
@@ -251,6 +254,11 @@ def with_points(
         progress: of the stages.
         on_sparse: called with the capture with triangulated points alone, if they are more.
     """
+    train_cameras = [capture.cameras[view] for view in capture.train_views]
+    if problem := unseen_points(train_cameras, capture.points):
+        _LOG.warning("%s: %s.", capture.path, problem)
+        none = np.zeros((0, 3))
+        capture = replace(capture, points=none, point_colors=none)
     if len(capture.points) >= _FEW_POINTS:
         return capture
     shared = match_capture(capture, progress.of("Matching views"))

@@ -14,6 +14,7 @@ from morgs_mi.fit.initialise import (
     in_empty_space,
     initial_points,
     seed_points,
+    unseen_points,
 )
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
@@ -160,3 +161,24 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
         _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras])
         is points
     )
+
+
+@pytest.mark.parametrize(
+    ("change", "share"),
+    [
+        (lambda points: points, None),
+        (lambda points: points[:0], None),
+        (lambda points: points - np.array([0, 0, 100]), 0),  # behind the cameras
+        (lambda points: points + np.array([50, 0, 0]), 0),  # beside the views
+        (lambda points: np.where(np.arange(len(points))[:, None] % 25, 50, points), 4),
+        (lambda points: np.where(np.arange(len(points))[:, None] % 10, 50, points), None),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 500])
+def test_unseen_points__names_points_that_hardly_a_camera_sees(change, share, count):
+    cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
+    points = change(np.tile(np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3)), (count, 1)))
+    start = "" if share is None else f"the cameras see {share} % of the {len(points)} points, which"
+    sentence = unseen_points(cameras, points)
+    assert sentence.startswith(start)
+    assert bool(sentence) == bool(start)

@@ -7,6 +7,7 @@ import pytest
 
 from morgs_mi.fit.fit_config import LearningRates
 from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.loop.first_frame import fit_gaussians
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.quick import quick
@@ -51,3 +52,20 @@ def test_push__status_names_a_fit_that_diverged(frame):
     assert (
         f"the training views have {reports[-1].psnr:.1f} dB, worse than constant images" in status
     )
+
+
+def test_push__seeds_points_where_no_camera_sees_the_given_ones(caplog):
+    """Points beside the views ended as a black image."""
+    means, colors = POINTS
+    loop = StreamLoop(views(), means + np.float32([50, 0, 0]), colors, QUICK)
+    _, report = loop.push(images())
+    assert report.status == (
+        "the cameras see 0 % of the 200 points, which are not used: check their axes and units; "
+        "too few points (0): seeded 200 random ones inside the views"
+    )
+    assert report.psnr > 15
+    warnings = [record.getMessage() for record in caplog.records]
+    caplog.clear()
+    fit_gaussians(views(), images(), means + np.float32([50, 0, 0]), colors, QUICK)
+    assert [record.getMessage() for record in caplog.records] == warnings
+    assert warnings[0].startswith("frame 0: the cameras see 0 % of the 200 points")

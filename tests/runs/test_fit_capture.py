@@ -23,10 +23,11 @@ from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.files import write_json
+from morgs_mi.core.progress import Progress
 from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
-from morgs_mi.runs.fit_capture import stream_capture, with_next
+from morgs_mi.runs.fit_capture import stream_capture, with_next, with_points
 from morgs_mi.runs.fit_files import Recording as Files
 from morgs_mi.runs.fit_files import read_reports, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
@@ -448,6 +449,16 @@ def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path):
     ):
         stream_capture(recording(), out, CONFIG)
     assert (capture / "capture.json").read_text() == "{}"
+
+
+def test_with_points__does_not_use_points_that_no_camera_sees(tmp_path, caplog):
+    """Others are found in the images."""
+    write_recording(tmp_path / "clip")
+    capture = load_capture(tmp_path / "clip")
+    assert with_points(capture, 0, Progress()) is capture
+    beside = replace(capture, points=capture.points + np.float32([50, 0, 0]))
+    assert with_points(beside, 0, Progress()).points[:, 0].max() < 10
+    assert "clip: the cameras see 0 % of the 150 points, which are not used: check" in caplog.text
 
 
 def test_read_reports__reads_frames_without_a_psnr(tmp_path):
