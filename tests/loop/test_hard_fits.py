@@ -1,4 +1,6 @@
-"""Recordings that are hard to reconstruct: every fit stays finite and shows what it can."""
+"""Recordings that are hard to reconstruct: every fit stays finite, shows what it can, and says what
+is wrong.
+"""
 
 import numpy as np
 import pytest
@@ -17,9 +19,12 @@ from tests.scenes.hard_fits import HARD_FITS, fitted
     ],
 )
 def test_push__stays_finite_on_hard_recordings(fit):
-    for quality, values, _ in fitted(fit):
+    statuses = []
+    for quality, values, status in fitted(fit):
         assert quality > fit.psnr
         assert all(np.isfinite(value).all() for value in values.values())
+        statuses.append(status)
+    assert any(fit.status in status for status in statuses)
 
 
 @pytest.mark.filterwarnings("error")

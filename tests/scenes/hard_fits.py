@@ -44,7 +44,7 @@ class HardFit:
         textured: whether the scene has a texture.
         config: settings of the fit.
         shift: from the scene to the points that the fit starts from.
-        status: word of the status of a frame; "ok" if all frames have this status.
+        status: words of the status of a frame, or "ok".
     """
 
     name: str
@@ -111,9 +111,9 @@ DIVERGING = replace(CONFIG, fit=replace(CONFIG.fit, first_frame_rates=LearningRa
 HARD_FITS = [
     HardFit("still, noise of 0.03", RIG, lambda images, t: eight_bits(images, 0.03, t), 300),
     HardFit("120 still frames", RIG, plain, 120),
-    HardFit("a black frame in mid-stream", RIG, with_a_black_frame, 5, status="black"),
-    HardFit("noise alone", RIG, noise, psnr=0.0),
-    HardFit("exposures 1:1000", RIG, bracketed, psnr=10.0),
+    HardFit("a black frame in mid-stream", RIG, with_a_black_frame, 5, psnr=5.0, status="black"),
+    HardFit("noise alone", RIG, noise, psnr=0.0, status="another scene"),
+    HardFit("exposures 1:1000", RIG, bracketed, psnr=10.0, status="worse than constant"),
     HardFit("light up to 1e5", RIG, blinding, psnr=0.0),
     HardFit("one camera", RIG[:1], plain),
     HardFit(
@@ -122,10 +122,22 @@ HARD_FITS = [
         plain,
     ),
     HardFit("no texture", RIG, plain, textured=False),
-    HardFit("black", RIG, lambda images, t: [np.zeros((36, 48, 3), np.uint8) for _ in images]),
-    HardFit("images of 1x1", rig_of(1, 1), plain, config=FEW),
+    HardFit(
+        "black",
+        RIG,
+        lambda images, t: [np.zeros((36, 48, 3), np.uint8) for _ in images],
+        status="black",
+    ),
+    HardFit("images of 1x1", rig_of(1, 1), plain, psnr=5.0, config=FEW, status="of one colour"),
     HardFit("2,000 steps on 8x6", rig_of(8, 6), plain, config=LONG),
-    HardFit("points that no camera sees", RIG, plain, shift=(0.0, 0.0, 500.0), psnr=0.0),
+    HardFit(
+        "points that no camera sees",
+        RIG,
+        plain,
+        shift=(0.0, 500.0, 0.0),
+        psnr=0.0,
+        status="the cameras see 0 %",
+    ),
     HardFit("rates x 100", RIG, plain, psnr=0.0, config=DIVERGING, status="worse than constant"),
 ]
 
