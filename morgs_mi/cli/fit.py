@@ -83,7 +83,6 @@ class Fit:
     arguments: ClassVar[Mapping[str, str]] = {
         "max_frames": "--frames",
         "test_view": "--hold-out",
-        "without": "--exclude",
     }
 
     def run(self) -> None:

@@ -8,7 +8,16 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_type_hints,
+)
 
 from tyro.conf import FlagCreatePairsOff, arg, subcommand
 from tyro.constructors import PrimitiveConstructorSpec
@@ -173,6 +182,8 @@ class Reading:
     """Cameras that are left out, by name."""
     near: Annotated[float | None, optional("UNITS", "(default: from the scene)")] = None
     """Depth of the cameras' near planes (docs/captures.md)."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"without": "--exclude"}
 
     def read_config(self) -> ReadConfig:
         """Return the options as `load_capture` takes them."""

@@ -76,6 +76,20 @@ def test_commands__name_what_was_expected_in_a_first_mistake(
     assert not Path("out").exists()
 
 
+@pytest.mark.parametrize("name", ["info", "calibrate", "fit", "live"])
+def test_commands__name_the_option_of_cameras_that_are_left_out(name, capture, tmp_path, run):
+    out = tmp_path / "out"
+    words = {
+        "info": (capture,),
+        "calibrate": (capture, "--overwrite"),
+        "fit": (capture, out),
+        "live": (out, "--camera", 0),
+    }[name]
+    status, _, error = run(name, *words, "--exclude", "nobody")
+    assert status == 1
+    assert "--exclude must name cameras of " in error.splitlines()[-1]
+
+
 def test_commands__name_no_folder_in_the_help_that_they_have_no_argument_for(capsys):
     places = (["render"], ["accuracy"], *(["export", name] for name in EXPORTS))
     for words in places:

@@ -148,7 +148,7 @@ def _print_stream(path: Path) -> None:
 class Calibrate:
     """Calibrate the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
 
-    folder: Positional[Path]
+    capture: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Folder of videos, or of one folder of images per camera."""
     config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(
         default_factory=CalibrateConfig
@@ -158,12 +158,14 @@ class Calibrate:
     overwrite: Flag = False
     """Replace an earlier model in FOLDER/sparse."""
 
+    arguments: ClassVar[Mapping[str, str]] = {"without": "--exclude"}
+
     def run(self) -> None:
         from morgs_mi.extras.calibration.calibrate import calibrate
 
         with progress() as report:
             result = calibrate(
-                self.folder,
+                self.capture,
                 self.config,
                 self.overwrite,
                 report,
@@ -181,7 +183,7 @@ class Calibrate:
             f"reprojection error {result.error:.2f} px, by {result.mapper} mapping{points}; scale "
             "and up direction of its world are arbitrary."
         )
-        print_next("info", self.folder)
+        print_next("info", self.capture)
 
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
