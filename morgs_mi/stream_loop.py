@@ -202,8 +202,8 @@ class StreamLoop:
 
     Args:
         cameras: the training views.
-        points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the
-            views.
+        points: SfM points [P, 3], world units; fewer than 20, or points of which the cameras see
+            less than 5 %, are replaced by random ones inside the views.
         point_colors: [P, 3], encoded: 1 is white.
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.

@@ -66,8 +66,8 @@ def fit_gaussians(
         images: an image [H, W, 3] per view: uint8 in sRGB, linear light as a float array or a
             `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. A dict has them by the
             names of the views.
-        points: [P, 3] of the scene, world units; None, or fewer than 20: random ones inside the
-            views.
+        points: [P, 3] of the scene, world units; None, fewer than 20, or points of which the
+            cameras see less than 5 %: random ones inside the views.
         point_colors: [P, 3], encoded: 1 is white; None: grey.
         config: settings of the first frame and the renderer; None: the defaults.
         masks: per view [H, W] bool of valid pixels, or None.

@@ -78,7 +78,7 @@ def stream_capture(
     every frame.
 
     OUT/capture.json has the capture's path and describes how it was read. Points are triangulated
-    where a capture has too few. OUT is locked meanwhile.
+    where a capture has too few, or has points that its cameras do not see. OUT is locked meanwhile.
 
     Args:
         capture: cameras and frames; the test view is not trained on, but is part of the stream's
@@ -245,8 +245,8 @@ def with_points(
     progress: Progress,
     on_sparse: Callable[[Capture], None] | None = None,
 ) -> Capture:
-    """Return a capture with the points of `dense_points` if it has few and they are more; see
-    `stream_capture`.
+    """Return a capture with the points of `dense_points` if it has few and they are more; points
+    that hardly a training camera sees are not counted, with a warning. See `stream_capture`.
 
     Args:
         capture: a capture.

@@ -61,7 +61,7 @@ def test_info__names_black_first_images(capture, run):
     for image in capture.glob("cam*/0000.png"):
         write_png(image, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     out = run("info", capture)[1]
-    assert "too few matches to check the poses: the first images are black, " in out
+    assert "has little texture, or the first images are black." in out
     assert f"{', '.join(NAMES)} not checked: its first image is black, of one colour or" in out
 
 

@@ -121,8 +121,8 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
             advice = f"the poses of {wrong} do not fit the images{rest}."
         elif not count:
             advice = (
-                "too few matches to check the poses: the first images are black, the views have "
-                "little overlap, or the scene has little texture."
+                "too few matches to check the poses: the views have little overlap, the scene has "
+                "little texture, or the first images are black."
             )
         else:
             some = f" of {count} of {len(checks)} cameras" if not_checked else ""
