@@ -13,7 +13,8 @@ from .evaluate.evaluate import evaluate_stream
 from .extras.light.insert import shadow_ratio, shadowed
 from .extras.light.light_probe import light_probe
 from .extras.live.sources import live_frames
-from .extras.sweep.sweep import leave_out, sweep
+from .extras.sweep.sweep import SweepResult, leave_out, sweep
+from .extras.sweep.vary import Vary
 from .extras.synth.synth_config import SynthConfig
 from .extras.synth.synthesize import synthesize
 from .fit.density import DensityControl
@@ -55,7 +56,9 @@ __all__ = [
     "SplatRays",
     "StreamConfig",
     "StreamLoop",
+    "SweepResult",
     "SynthConfig",
+    "Vary",
     "accuracy",
     "channel_image",
     "confidence_image",

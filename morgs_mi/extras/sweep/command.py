@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import (
@@ -19,15 +20,16 @@ from morgs_mi.cli.settings import (
     options,
     place,
 )
+from morgs_mi.extras.sweep.vary import Vary
 from morgs_mi.loop.stream_config import PresetName
 
 
 @options
 class Sweep:
-    """Fit and score a capture with several presets, numbers of epochs and seeds: error against run
-    time.
+    """Fit and score a capture with several presets, numbers of steps and epochs, and seeds: error
+    against run time.
 
-    Fits that are in OUT are not made again.
+    Results are written after each fit. Fits that are in OUT are not made again.
     """
 
     capture: Positional[Path]
@@ -36,18 +38,22 @@ class Sweep:
     """Folder for the streams, sweep.json and sweep.png, by default sweep."""
     presets: tuple[PresetName | Literal["default"], ...] = ("baseline", "default")
     """Presets; default: the settings as they are."""
-    epochs: tuple[int, ...] = (1, 2, 4, 8)
+    epochs: tuple[int, ...] = Vary.epochs
     """Passes over the views for every later frame."""
+    first_frame_steps: tuple[int, ...] = Vary.first_frame_steps
+    """Steps of fits of the first frame alone."""
+    measure: Annotated[str, arg(metavar="NAME")] = Vary.measure
+    """Score that is compared: psnr, psnr_moving, ssim, motion_error_moving or lpips:FILE.onnx."""
     seeds: int = 3
-    """Number of fits with each, whose scores are averaged."""
+    """Number of fits with each, in turn with the others; scores are averaged."""
     frames: int = 8
     """Most frames that are fitted, from the first one."""
     leave_out: Flag = False
-    """Instead of presets and epochs, leave out each part of the method alone, and print the
-    settings that the scene does not need.
+    """Leave out each part of the method alone instead, and print the settings that the scene does
+    not need.
     """
     tolerance: float = 0.05
-    """Loss of PSNR up to which a part is not needed, dB."""
+    """Loss of PSNR up to which a part is not needed, dB; of motion error, bytes and seconds 5 %."""
     downscale: float = 1
     """Factor by which the images are reduced."""
     hold_out: HeldOut = ("auto",)
@@ -59,24 +65,41 @@ class Sweep:
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
+        from morgs_mi.core.bounded import read_json
+        from morgs_mi.core.config import apply_values
         from morgs_mi.core.plots import check_plot
-        from morgs_mi.extras.sweep.sweep import leave_out, sweep
+        from morgs_mi.extras.sweep.sweep import CONFIGS, leave_out, sweep
 
-        name = "leave-out" if self.leave_out else "sweep"
-        plot = self.out / f"{name}.png"
-        check_plot(plot)
+        results = self.out / ("leave-out.json" if self.leave_out else "sweep.json")
+        check_plot(results.with_suffix(".png"))
         config = Settings(config=self.config).stream_config()
+        configs = {name: apply_values(config, CONFIGS[name]) for name in self.presets}
         capture = load_capture(self.capture, self.downscale, held_out(self.hold_out))
-        common = (self.seeds, self.frames, self.out, config)
-        with progress() as report:
-            if self.leave_out:
-                result = leave_out(capture, self.tolerance, *common, report)
-            else:
-                result = sweep(capture, self.presets, self.epochs, *common, report)
-        titles, *rows = result.table
-        table = Table(*titles, box=SIMPLE_HEAD, title="means ± standard deviations over the seeds")
+        common = (self.seeds, self.frames, self.out)
+        try:
+            with progress() as report:
+                if self.leave_out:
+                    leave_out(capture, self.tolerance, *common, config, report)
+                else:
+                    vary = Vary(self.epochs, self.first_frame_steps, self.measure)
+                    sweep(capture, configs, vary, *common, report)
+        except KeyboardInterrupt as error:
+            print_document(read_json(results))
+            error.add_note("The same command goes on from there.")
+            raise
+        print_document(read_json(results))
+        print_result(f"Results: {results}, {results.with_suffix('.png')}")
+
+
+def print_document(document: Mapping[str, Any]) -> None:
+    """Print the tables and sentences in the JSON file of a result."""
+    for title, (titles, *rows) in document["tables"].items():
+        print_result(f"\n{title}")
+        table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+        for column in titles:
+            table.add_column(column, justify="right", vertical="bottom", no_wrap=True)
+        table.columns[0].justify = "left"
         for row in rows:
             table.add_row(*row)
-        print_table(table)
-        result.plot(plot)
-        print_result(f"{result.sentence}\n{result.toml}\nResults: {self.out / name}.json, {plot}")
+        print_table(table, ["first\nframe\ns"])
+    print_result(f"\n{document['sentence']}\n{document['toml']}".rstrip())

@@ -1,13 +1,14 @@
-"""Plot of a sweep."""
+"""Plots of a sweep."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from itertools import cycle
-from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from morgs_mi.extras.sweep.report import AXES, select_names
+from morgs_mi.extras.sweep.statistics import DECIDING, INDEX, SCORES, mean_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,71 +17,63 @@ if TYPE_CHECKING:
 
 # Of Okabe and Ito, which readers with any vision of colours distinguish.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-# Titles of the panels, by the scores' indices.
-_PANELS = {
-    2: "PSNR, dB",
-    3: "PSNR of moving pixels, dB",
-    4: "motion error of moving pixels, px",
-    5: "size, kB",
-}
-_FIRST = "PSNR of the first frame, dB"
+# Of changes that decide, and of others.
+_DECISIVE = "#D55E00"
+_OTHER = "#0072B2"
+# Scores over the seconds of a later frame, beside the measure.
+_PANELS = ("psnr", "psnr_moving", "motion_error_moving", "kilobytes")
 # Inches.
 _WIDTH = 9.0
 _HEIGHT = 3.3  # of a panel
+_ROW = 0.28  # of a part
+_FRAME = 1.4  # of titles and axes
 # Least range of an axis of PSNR, dB, and least ratio of the ends of an axis of seconds.
 _LEAST_DB = 3.0
 _LEAST_RATIO = 6.0
 # Least distance of two names, as a share of the height of a panel.
 _DISTANCE = 0.08
-
-# Seconds and scores [P, S] of P points of a curve and S seeds, and a label of each point.
-Curve = tuple[np.ndarray, np.ndarray, Sequence[Any] | np.ndarray]
+# Standard errors of the bars of changes: those that a decisive change exceeds.
+_BARS = 2
 
 
 def draw_sweep(result: SweepResult) -> Figure:
-    """Return the plot of a sweep: the scores over the seconds of a later frame, a curve for each
-    arm, and the PSNR of the first frame over the seconds since its fit began.
+    """Return the plot of a sweep: the measure over the seconds of the first frame, and the scores
+    over those of a later frame, a curve for each config.
 
     Raises:
         ImportError: matplotlib is not installed.
     """
     from matplotlib.figure import Figure
 
-    panels: dict[str, dict[str, Curve]] = {}
-    for k, title in _PANELS.items():
-        if np.isfinite(result.scores[..., k]).any():
-            panels[title] = {}
-            for name in result.arms:
-                rows = np.flatnonzero(np.array(result.arms) == name)
-                x, y = result.scores[rows][..., [1, k]].transpose(2, 0, 1)
-                panels[title][name] = x, y, np.array(result.epochs)[rows]
-    # Seeds may balance exposures in different numbers of rounds, which come first.
-    count = min(len(curve) for curve in result.first_frames)
-    first_frames = [curve[-count:] for curve in result.first_frames]
-    panels[_FIRST] = {"first frame": (*np.transpose(first_frames, (2, 1, 0)), ())}
-    lines = -(-len(panels) // 2)
+    later_rows = np.concatenate([np.zeros(0, int), *result.curves(False).values()])
+    scores = select_names((result.measure, *_PANELS), mean_of(result.scores).mean[later_rows])
+    panels = [(False, name) for name in scores]
+    if result.curves(True):
+        panels.append((True, result.measure))
+    lines = -(-max(len(panels), 1) // 2)
     figure = Figure((_WIDTH, _HEIGHT * lines), layout="constrained")
-    views = "held-out" if result.held_out else "training"
-    seeds = len(result.first_frames)
-    title = f"{result.capture}, {views} views; numbers: epochs"
-    bars = f"; bars: standard deviation over {seeds} seeds"
-    figure.suptitle(title + bars * (seeds > 1), parse_math=False)
-    for place, (title, curves) in enumerate(panels.items(), 1):
-        draw_curves(figure.add_subplot(lines, 2, place), title, curves)
+    remark = "numbers: epochs or steps; bars: standard errors"
+    figure.suptitle(_title(result, remark), parse_math=False)
+    for place, (first_alone, name) in enumerate(panels, 1):
+        draw_curves(figure.add_subplot(lines, 2, place), result, first_alone, name)
     return figure
 
 
-def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
-    """Draw a score over seconds, a curve for each arm with its name at the end."""
+def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) -> None:
+    """Draw a score over seconds, a curve for each config with its name at the end."""
+    score = SCORES[name]
+    title, _, seconds = AXES[first_alone]
+    means = mean_of(result.scores)
+    points = np.stack([means.mean[:, INDEX[seconds]], means.mean[:, INDEX[name]]], 1)
     ends = []
-    for color, (name, (x, y, labels)) in zip(cycle(_COLORS), curves.items(), strict=False):
-        errors = (values.std(1, ddof=1) if values.shape[1] > 1 else None for values in (y, x))
-        x = x.mean(1)
-        y = y.mean(1)
-        axes.errorbar(x, y, *errors, color=color, marker="o", markersize=4, capsize=2)
-        for label, *place in zip(labels, x, y, strict=False):
-            axes.annotate(label, place, (0, 5), textcoords="offset points", color=color, fontsize=7)
-        ends.append((y[-1], x[-1], name, color))
+    for color, (label, rows) in zip(cycle(_COLORS), result.curves(first_alone).items()):
+        errors = means.error[rows][:, [INDEX[name], INDEX[seconds]]].T
+        style = {"color": color, "marker": "o", "markersize": 4, "capsize": 2}
+        axes.errorbar(*points[rows].T, *errors, **style)
+        for k in rows:
+            place = {"xytext": (0, 5), "textcoords": "offset points", "fontsize": 7}
+            axes.annotate(result.points[k], points[k], color=color, **place)
+        ends.append((*points[rows[-1]][::-1], label, color))
     axes.set_xscale("log", subs=[2, 5])
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("{x:g}")
@@ -90,25 +83,58 @@ def draw_curves(axes: Any, title: str, curves: Mapping[str, Curve]) -> None:
     axes.margins(y=0.15)
     low, high = axes.get_ylim()
     margin = max(_LEAST_DB - (high - low), 0) / 2
-    low, high = (low - margin, high + margin) if title.endswith("dB") else (0, 1.05 * high)
+    low, high = (low - margin, high + margin) if score.unit == "dB" else (low, high)
     axes.set_ylim(low, high)
-    axes.set_title(title, loc="left")
-    axes.set_xlabel("seconds since its start" if title == _FIRST else "seconds of a later frame")
+    axes.set_title(f"{score.label}: {title}", loc="left", fontsize="medium")
+    axes.set_xlabel(f"seconds of the {title}")
     axes.grid(color="0.9")
     # Names beside the panel, in the order of the ends and apart from each other.
     ends.sort()
     shifts = _DISTANCE * np.arange(len(ends))
     heights = (np.array([end[0] for end in ends]) - low) / (high - low) - shifts
     heights = np.maximum.accumulate(np.minimum(heights, 1 - shifts[-1])) + shifts
-    for height, (y, x, name, color) in zip(heights, ends, strict=True):
-        place = (1.03, height)
-        axes.annotate(
-            shorten(name, 24),
-            (x, y),
-            place,
-            "data",
-            "axes fraction",
-            {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)},
-            color=color,
-            va="center",
-        )
+    for height, (y, x, label, color) in zip(heights, ends, strict=True):
+        arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
+        place = {"xytext": (1.03, height), "textcoords": "axes fraction", "va": "center"}
+        axes.annotate(label, (x, y), arrowprops=arrow, color=color, **place)
+
+
+def draw_changes(result: SweepResult) -> Figure:
+    """Return the plot of `leave_out`: the changes of the scores without each part; those that
+    decide that it is needed have another colour.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    from matplotlib.figure import Figure
+
+    rows = result.ablations
+    changes = result.changes
+    names = select_names(DECIDING, changes.mean[rows])
+    figure = Figure((_WIDTH, _FRAME + _ROW * len(rows)), layout="constrained")
+    remark = "orange: needed because of it; bars: twice the standard errors"
+    figure.suptitle(_title(result, remark), parse_math=False)
+    heights = -np.arange(len(rows))
+    labels = np.char.replace(result.names, "without ", "")[rows]
+    first_axes = None
+    for place, name in enumerate(names, 1):
+        axes = figure.add_subplot(1, len(names), place, sharey=first_axes)
+        first_axes = first_axes or axes
+        decides = result.excess[rows, DECIDING.index(name)] > 1
+        values = changes.mean[rows, INDEX[name]]
+        errors = _BARS * changes.error[rows, INDEX[name]]
+        colors = np.where(decides, _DECISIVE, _OTHER)
+        axes.axvline(0, color="0.5", linewidth=1)
+        axes.hlines(heights, values - errors, values + errors, colors.tolist())
+        axes.scatter(values, heights, 20, colors)
+        axes.set_yticks(heights, labels)
+        axes.tick_params(labelleft=place == 1)
+        axes.set_title(f"{SCORES[name].title}\n{SCORES[name].unit}", fontsize="medium")
+        axes.grid(color="0.9")
+    return figure
+
+
+def _title(result: SweepResult, remark: str) -> str:
+    """Return the title of a plot: what was fitted, and a remark."""
+    views = "held-out" if result.held_out else "training"
+    return f"{result.capture}, {views} views, seeds: {result.scores.shape[1]}; {remark}"

@@ -1,49 +1,55 @@
 """Error against run time of a capture, and the parts of the method that it does not need.
 
-An arm is the method with some settings, under a name. All arms of a seed continue the same fit of
-the first frame, so they differ in later frames alone. Fits that are in the folder of the results,
-of the same capture and with the same settings, are not made again.
+An arm is the method with some settings, under a name. All arms of a seed whose settings agree in
+the first frame continue the same fit of it, so they differ in later frames alone. Fits that are in
+the folder of the results, of the same capture and with the same settings, are not made again.
 """
 
 from __future__ import annotations
 
 import base64
 import html
-import json
-import time
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.util import find_spec
 from io import BytesIO
+from itertools import product
 from pathlib import Path
-from textwrap import shorten
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.codec.container import Packet
-from morgs_mi.codec.packets import decode
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.config import Count, apply_values, check_value, config_or_default
+from morgs_mi.core.config import (
+    Count,
+    NonNegative,
+    apply_values,
+    check_type,
+    check_value,
+    config_or_default,
+)
 from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.files import write_json
 from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.plots import check_plot
+from morgs_mi.core.plots import check_plot, save_plot
 from morgs_mi.core.progress import Progress, Report
-from morgs_mi.evaluate.comparison import ComparedClip
-from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.evaluate.results import ViewScores, known_mean
-from morgs_mi.extras.sweep.plot import draw_sweep
-from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
-from morgs_mi.playback.streams import open_stream
-from morgs_mi.runs.fit_capture import begin_as, push_frame, stream_capture, with_points
-from morgs_mi.runs.fit_files import stream_metadata
-from morgs_mi.stream_loop import StreamLoop
+from morgs_mi.extras.sweep.clock import busy_sentence, moment
+from morgs_mi.extras.sweep.fits import Arm, Fits, first_frame_config, fit_arms
+from morgs_mi.extras.sweep.plot import draw_changes, draw_sweep
+from morgs_mi.extras.sweep.report import (
+    Table,
+    ablation_name,
+    leave_out_sentence,
+    leave_out_tables,
+    sweep_report,
+)
+from morgs_mi.extras.sweep.statistics import DECIDING, INDEX, SCORES, Means, excess, mean_of
+from morgs_mi.extras.sweep.vary import Vary
+from morgs_mi.loop.stream_config import PRESETS, PresetName, StreamConfig
 
 PARTS = {
     "flow guidance": "motion.learn_motion = false",
@@ -62,44 +68,92 @@ PARTS = {
 """Parts of the method that can be left out, with the settings that do so. Without flow guidance,
 the motion starts from zero as well.
 """
-TITLES = ("first, s", "later, s", "PSNR, dB", "moving, dB", "motion error, px", "kB")
-"""Titles of the scores: seconds of the first frame, and of a later one; PSNR of the images and of
-moving pixels; endpoint error of the motion where surfaces move; kilobytes of a later frame.
-"""
-# Parts that act on the first frame.
-_FIRST_PARTS = {"density control", "SH above 0", "exposure"}
-# The first frame and two later ones, with masks, compile the kernels of an arm.
-_WARM_FRAMES = 3
-_WARM = {"fit": {"first_frame_steps": 60, "epochs": 2}, "motion": {"mask_interval": 1}}
-# Share by which seconds, motion error and bytes may grow without a part that is not needed.
-_COST_TOLERANCE = 0.05
+ConfigName = PresetName | Literal["default"]
+"""Name of a config: a preset, or the defaults."""
+CONFIGS: Mapping[str, Mapping[str, Any]] = {"default": {}, **PRESETS}
+"""Settings of each."""
+_VARY = Vary()
+_MEASURES = ("psnr", "psnr_moving", "ssim", "motion_error_moving", "lpips")
 
 
-# Name, settings, and whether the arm continues the first frame that most share.
-Arm = tuple[str, StreamConfig, bool]
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SweepResult:
-    """Scores of fits of a capture by several arms. In a notebook it is a table and a plot."""
+    """Scores of fits of a capture by several arms. In a notebook it is tables and a plot.
 
-    capture: str  #: Name of the capture.
-    held_out: bool  #: Whether held-out views are scored; otherwise all training views.
-    arms: Sequence[str]  #: Names of the A arms; an arm with another number of epochs is another.
-    epochs: Sequence[int]  #: Their numbers of epochs.
-    #: Scores [A, S, 6] of S seeds, in the order of `TITLES`; NaN where unknown. All but the seconds
-    #: of the first frame are means over the later frames.
+    Attributes:
+        capture: name of the capture.
+        held_out: whether held-out views are scored; otherwise all training views.
+        arms: the A arms.
+        scores: [A, S, N] of S seeds, in the order of `morgs_mi.extras.sweep.statistics.SCORES`; NaN
+            where unknown, or not fitted yet.
+        reference: index of the arm that each arm is compared with [A].
+        measure: name of the score that a sweep compares.
+        excess: of `leave_out`, by how many times losses exceed their bounds [A, D], see
+            `morgs_mi.extras.sweep.statistics.excess`; empty of `sweep`.
+        tables: by their titles, lists of rows, the first with the names of the columns.
+        sentence: sentences on the result, one a line.
+        toml: settings that leave out the parts that the scene does not need, of `leave_out`.
+    """
+
+    capture: str
+    held_out: bool
+    arms: Sequence[Arm]
     scores: np.ndarray
-    #: Of each seed, pairs while the first frame was fitted: seconds, and PSNR in dB.
-    first_frames: Sequence[Sequence[tuple[float, float]]]
-    #: Titles, then means over the seeds ± standard deviations; of `leave_out`, differences from the
-    #: arm with all parts.
-    table: Sequence[Sequence[str]] = ()
-    sentence: str = ""  #: Parts that the scene does not need, of `leave_out`.
-    toml: str = ""  #: Settings that leave them out.
+    reference: np.ndarray
+    measure: str = "psnr"
+    excess: np.ndarray = field(default_factory=partial(np.zeros, (0, len(DECIDING))))
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    sentence: str = ""
+    toml: str = ""
+
+    @property
+    def names(self) -> np.ndarray:
+        """Names of the arms [A]."""
+        return np.array([arm.name for arm in self.arms])
+
+    @property
+    def points(self) -> np.ndarray:
+        """Numbers [A] that are varied along a curve: epochs, or steps of the first frame."""
+        return np.array([arm.point for arm in self.arms])
+
+    @property
+    def changes(self) -> Means:
+        """Means over the seeds of the paired differences from the arms of `reference`."""
+        with np.errstate(invalid="ignore"):
+            return mean_of(self.scores - self.scores[self.reference])
+
+    @property
+    def ablations(self) -> np.ndarray:
+        """Indices of the arms of `leave_out` that lack something and have scores."""
+        is_other = self.reference != np.arange(len(self.reference))
+        return np.flatnonzero(is_other & np.isfinite(self.scores).any((1, 2)))
+
+    @property
+    def reasons(self) -> np.ndarray:
+        """Title of the score [A] because of which what an arm of `leave_out` lacks is needed most;
+        empty if it is not needed.
+        """
+        ratios = np.nan_to_num(self.excess)
+        titles = np.array([SCORES[name].title for name in DECIDING])
+        return np.where(ratios.max(1) > 1, titles[ratios.argmax(1)], "")
+
+    def curves(self, first_alone: bool) -> dict[str, np.ndarray]:
+        """Return the indices of the arms of each curve that have scores, by its name.
+
+        Args:
+            first_alone: whether of fits of the first frame alone.
+        """
+        is_first = np.array([arm.first_alone for arm in self.arms], bool)
+        has_scores = np.isfinite(self.scores).any((1, 2)) & (is_first == first_alone)
+        names = self.names
+        return {
+            name: np.flatnonzero(has_scores & (names == name))
+            for name in dict.fromkeys(names[has_scores].tolist())
+        }
 
     def plot(self, path: str | Path) -> None:
-        """Draw the scores over the seconds of a later frame, a curve for each arm.
+        """Draw the scores over the seconds, a curve for each config; of `leave_out`, the changes
+        without each part.
 
         Raises:
             ValueError: as `check_plot`.
@@ -107,63 +161,135 @@ class SweepResult:
         """
         path = Path(path)
         check_plot(path)
-        draw_sweep(self).savefig(path)
+        save_plot(path, self._figure(), "SweepResult.plot()")
+
+    def __repr__(self) -> str:
+        arms, seeds, _ = self.scores.shape
+        return f"SweepResult({self.capture}, {arms} arms, {seeds} seeds)"
+
+    def _figure(self) -> Any:
+        return draw_changes(self) if self.excess.size else draw_sweep(self)
 
     def _repr_html_(self) -> str:
-        rows = ("".join(f"<td>{html.escape(cell)}" for cell in row) for row in self.table)
-        text = f"<table><tr>{'<tr>'.join(rows)}</table>{html.escape(self.sentence)}"
+        text = ""
+        for title, table in self.tables.items():
+            rows = "".join(f"<tr><td>{'<td>'.join(map(html.escape, row))}" for row in table)
+            text += f"<table><caption>{html.escape(title)}</caption>{rows}</table>"
         with suppress(ImportError):
             data = BytesIO()
-            draw_sweep(self).savefig(data)
+            self._figure().savefig(data)
             image = base64.b64encode(data.getvalue()).decode()
-            text += f'<img alt="Scores over seconds" src="data:image/png;base64,{image}">'
-        return f"{text}<pre>{self.toml}</pre>"
+            text += f'<img alt="Scores" src="data:image/png;base64,{image}">'
+        return f"{text}<pre>{html.escape(self.sentence)}\n{self.toml}</pre>"
 
 
 @interrupts_raised()
 def sweep(
     capture: Capture,
-    presets: Sequence[PresetName | Literal["default"]] = ("baseline", "default"),
-    epochs: Sequence[int] = (1, 2, 4, 8),
+    configs: Sequence[ConfigName] | Mapping[str, StreamConfig] = ("baseline", "default"),
+    vary: Vary = _VARY,
     seeds: int = 3,
     frames: int = 8,
     out: str | Path = "sweep",
-    config: StreamConfig | None = None,
     progress: Report | None = None,
 ) -> SweepResult:
-    """Fit and evaluate a capture with each preset, number of epochs and seed: error against run
-    time.
+    """Fit and evaluate a capture with several configs, numbers of steps of the first frame, of
+    epochs of later frames, and seeds: error against run time.
 
-    OUT/baseline-epochs4-seed0 etc. have the streams, OUT/sweep.json the result with machine and
-    versions. Fits that are there, of the same capture and with the same settings, are not made
+    The cheapest fits come first, and all fits of a seed before those of the next one. After each of
+    them, OUT/sweep.json has the result so far, with machine, load, settings and versions, and
+    OUT/sweep.png its plot where matplotlib is installed. OUT/baseline-epochs4-seed0 etc. have the
+    streams. Fits that are there, of the same capture and with the same settings, are not made
     again; others of these names are replaced.
 
     Args:
         capture: the capture.
-        presets: names of presets, or "default" for `config` as it is.
-        epochs: passes over the views for every later frame.
+        configs: names of presets, and "default" for the defaults; or settings by any name.
+        vary: what is varied, and the measure.
         seeds: number of seeds 0, 1, ....
         frames: most frames that are fitted, from the first one, at least two.
         out: folder.
-        config: settings that the presets change.
         progress: called with (stage, done, total).
 
+    Example:
+        >>> few = morgs_mi.StreamConfig(fit=morgs_mi.FitConfig(num_gaussians=5000))
+        >>> result = morgs_mi.sweep(capture, {"default": morgs_mi.StreamConfig(), "few": few})
+        >>> print(result.sentence)
+
     Raises:
-        ValueError: a number is too small, a preset is unknown, or as `stream_capture`.
+        ValueError: a number is too small, a preset or the measure is unknown, or as
+            `stream_capture`.
         OSError: as `stream_capture`.
     """
-    config = config_or_default("sweep()", config, StreamConfig())
-    arms = []
-    for preset in presets:
-        method = config if preset == "default" else apply_preset(config, preset)
-        for count in sorted({*epochs}):
-            arms.append((preset, replace(method, fit=replace(method.fit, epochs=count)), True))
-    result = fit_arms(arms, config, capture, seeds, frames, Path(out), progress)
-    table = [
-        [arm, str(count), *_cells(scores)]
-        for arm, count, scores in zip(result.arms, result.epochs, result.scores, strict=True)
+    if not isinstance(configs, Mapping):
+        check_value("sweep()", "configs", tuple(configs), tuple[Literal[*CONFIGS], ...])
+        configs = {name: apply_values(StreamConfig(), CONFIGS[name]) for name in configs}
+    check_type("sweep()", "vary", vary, Vary)
+    check_value("sweep()", "epochs", tuple(vary.epochs), tuple[Count, ...])
+    check_value("sweep()", "first_frame_steps", tuple(vary.first_frame_steps), tuple[Count, ...])
+    measure = vary.measure.partition(":")[0]
+    check_value("sweep()", "measure", measure, Literal[_MEASURES])
+    capture = _beginning(capture, frames, seeds)
+
+    first_names: dict[StreamConfig, list[str]] = {}
+    for name, config in configs.items():
+        check_type("sweep()", "name of a config", name, str)
+        check_type("sweep()", f"configs[{name!r}]", config, StreamConfig)
+        first_config = _with_steps(first_frame_config(config), None)
+        first_names.setdefault(first_config, []).append(name)
+    arms = [
+        Arm(" and ".join(names), _with_steps(config, steps), steps, first_alone=True)
+        for steps, (config, names) in product(
+            sorted({*vary.first_frame_steps}), first_names.items()
+        )
     ]
-    return _written(result, Path(out) / "sweep.json", [["arm", "epochs", *TITLES], *table])
+    arms += [
+        Arm(name, replace(config, fit=replace(config.fit, epochs=epochs)), epochs)
+        for epochs, (name, config) in product(sorted({*vary.epochs}), configs.items())
+    ]
+    if not arms:
+        raise ValueError("sweep(): expected a config and something to vary, got none; name some.")
+    # The first arm of the same number.
+    places = {(arm.first_alone, arm.point): k for k, arm in reversed([*enumerate(arms)])}
+    reference = np.array([places[arm.first_alone, arm.point] for arm in arms], int)
+
+    settings = _reading(capture)
+    settings["configs"] = {name: asdict(config) for name, config in configs.items()}
+
+    def write(fits: Fits) -> SweepResult:
+        held_out = bool(capture.test_views)
+        result = SweepResult(capture.path.name, held_out, arms, fits.scores, reference, measure)
+        tables, sentence = sweep_report(result)
+        result = replace(result, tables=tables, sentence=sentence)
+        return _write_result(result, Path(out) / "sweep.json", fits, settings)
+
+    stage = Progress(progress, "Fitting and evaluating")
+    return write(fit_arms(arms, capture, seeds, Path(out), vary.measure, stage, write))
+
+
+def _with_steps(config: StreamConfig, steps: int | None) -> StreamConfig:
+    """Return settings with another number of steps of the first frame."""
+    return replace(config, fit=replace(config.fit, first_frame_steps=steps))
+
+
+def _beginning(capture: Capture, frames: int, seeds: int) -> Capture:
+    """Return the first frames of a capture, at least two, so that there is a later one; check the
+    number of seeds.
+    """
+    check_value("sweep()", "seeds", seeds, Count)
+    check_value("sweep()", "frames", frames, Count)
+    frames = min(frames, capture.num_frames)
+    check_value("sweep()", "frames", frames, Annotated[int, Ge(2)])
+    return replace(capture, num_frames=frames)
+
+
+def _reading(capture: Capture) -> dict[str, Any]:
+    """Return how a capture was read, for the JSON of a result."""
+    return {
+        "num_frames": capture.num_frames,
+        "downscale": capture.downscale,
+        "test_views": capture.test_views,
+    }
 
 
 @interrupts_raised()
@@ -179,15 +305,20 @@ def leave_out(
     """Fit and evaluate a capture without each of the `PARTS` of the method that `config` uses, and
     without all together that it does not need.
 
-    A part is not needed if, without it, the PSNR of the images and that of their moving pixels fall
-    by at most `tolerance`, and the motion error, the seconds and the bytes of a later frame rise by
-    at most 5 %, in the mean over the seeds.
-    Parts may stand in for each other: while those that are not needed alone are needed together,
-    the one that costs most PSNR stays in.
+    A part is needed because of a score if the paired difference without it, of fits with the same
+    seed and of the same first frame, exceeds twice its standard error over the seeds, and the
+    tolerance: `tolerance` of the PSNR of the images or of their moving pixels, 5 % of the motion
+    error, the bytes or the seconds of a later frame. Parts that act on the first frame have a fit
+    of it of their own. See `morgs_mi.extras.sweep.statistics.excess` for the seconds, and for one
+    seed.
 
-    A part that acts on the first frame has another fit of it. OUT/without-search-epochs8-seed0 etc.
-    have the streams, OUT/leave-out.json the result, and OUT/leave-out.toml the settings that leave
-    out what is not needed, for `fit --config`.
+    Parts may stand in for each other: while those that are not needed alone are needed together,
+    the one that costs most PSNR stays in. Fits without several parts run in turn with further fits
+    with all of them, so that their seconds can be compared.
+
+    OUT/without-search-epochs8-seed0 etc. have the streams; OUT/leave-out.json and OUT/leave-out.png
+    the result so far, as of `sweep`; and at the end OUT/leave-out.toml the settings that leave out
+    what is not needed, for `fit --config`.
 
     Args:
         capture: the capture.
@@ -203,51 +334,58 @@ def leave_out(
         OSError: as `sweep`.
     """
     config = config_or_default("leave_out()", config, StreamConfig())
-    common = (config, capture, seeds, frames, Path(out), progress)
+    check_value("leave_out()", "tolerance", tolerance, NonNegative)
+    capture = _beginning(capture, frames, seeds)
+    path = Path(out) / "leave-out.json"
+    stage = Progress(progress, "Fitting and evaluating")
+    settings = _reading(capture)
+    settings |= {"tolerance": tolerance, "configs": {"all parts": asdict(config)}}
+    epochs = config.fit.epochs
+    arms: list[Arm] = []
+    reference = np.zeros(0, int)
+    fits = Fits.of(0, seeds)
 
-    def without(parts: Sequence[str]) -> Arm:
-        method = apply_values(config, tomllib.loads(_toml(parts)))
-        return f"without {', '.join(parts)}", method, _FIRST_PARTS.isdisjoint(parts)
+    def without(parts: Sequence[str]) -> StreamConfig:
+        return apply_values(config, tomllib.loads(_toml(parts)))
 
-    parts = [part for part in PARTS if without([part])[1] != config]
-    arms = [("all parts", config, True), *(without([part]) for part in parts)]
-    result = fit_arms(arms, *common)
-    needed = _are_needed(result, tolerance)
-    left_out = [part for part, is_needed in zip(parts, needed[1:], strict=True) if not is_needed]
+    def compare(name: str, others: Sequence[Arm]) -> SweepResult:
+        """Fit all parts, under a name, in turn with other arms; return the result so far."""
+        nonlocal reference
+        earlier = fits
+        new_arms = [Arm(name, config, epochs), *others]
+        reference = np.concatenate([reference, np.full(len(new_arms), len(arms))])
+        arms.extend(new_arms)
+
+        def write(later: Fits) -> SweepResult:
+            nonlocal fits
+            fits = earlier + later
+            held_out = bool(capture.test_views)
+            result = SweepResult(capture.path.name, held_out, arms, fits.scores, reference)
+            ratios = excess(fits.scores, reference, fits.calls, tolerance)
+            result = replace(result, excess=ratios)
+            result = replace(result, tables=leave_out_tables(result))
+            return _write_result(result, path, fits, settings)
+
+        return write(fit_arms(new_arms, capture, seeds, Path(out), "psnr", stage, write))
+
+    parts = [part for part in PARTS if without([part]) != config]
+    single_arms = [Arm(ablation_name([part]), without([part]), epochs) for part in parts]
+    result = compare("all parts", single_arms)
+    needed = dict(zip(parts, result.reasons[1:], strict=True))
+    losses = dict(zip(parts, result.changes.mean[1:, INDEX["psnr"]], strict=True))
+    left_out = [part for part in parts if not needed[part]]
     while len(left_out) > 1:
-        result = fit_arms([*arms, without(left_out)], *common)
-        needed = _are_needed(result, tolerance)
-        if not needed[-1]:
+        # With all parts once more, so that seconds are of fits that ran in turn.
+        arm = Arm(ablation_name(left_out), without(left_out), epochs)
+        result = compare(f"all parts beside {len(left_out)}", [arm])
+        if not result.reasons[-1]:
             break
-        losses = result.scores.mean(1)[:, 2]
-        left_out.remove(min(left_out, key=lambda part: losses[1 + parts.index(part)]))
-    changes = result.scores - result.scores[:1]
-    table = [["", *TITLES, "needed"], [result.arms[0], *_cells(result.scores[0]), ""]]
-    for k in range(1, len(changes)):
-        name = shorten(result.arms[k], 40)
-        table.append([name, *_cells(changes[k], "+"), "yes" if needed[k] else "no"])
-    sentence = f"Within {tolerance:g} dB, this scene needs each of the parts."
-    if left_out:
-        k = result.arms.index(without(left_out)[0])
-        _, seconds, *_ = _cells(result.scores[k])
-        sentence = (
-            f"Within {tolerance:g} dB, this scene does not need {', '.join(left_out)}: without, a "
-            f"later frame takes {seconds} s instead of {table[1][2]} s, and its PSNR changes by "
-            f"{table[k + 1][3]} dB."
-        )
+        left_out.remove(min(left_out, key=losses.__getitem__))
     toml = _toml(left_out)
     (Path(out) / "leave-out.toml").write_text(toml, encoding="utf-8")
-    return _written(result, Path(out) / "leave-out.json", table, sentence, toml)
-
-
-def _are_needed(result: SweepResult, tolerance: float) -> np.ndarray:
-    """Return, for each arm, whether the parts that it lacks are needed; see `leave_out`."""
-    means = result.scores.mean(1)
-    changes = means - means[0]
-    loss = -np.fmin(changes[:, 2], changes[:, 3])
-    costs = [1, 4, 5]
-    # Comparisons with unknown scores are false.
-    return (loss > tolerance) | (changes[:, costs] > _COST_TOLERANCE * means[0, costs]).any(1)
+    sentence = leave_out_sentence(result, left_out, tolerance)
+    result = replace(result, sentence=sentence, toml=toml)
+    return _write_result(result, path, fits, settings)
 
 
 def _toml(parts: Sequence[str]) -> str:
@@ -255,153 +393,46 @@ def _toml(parts: Sequence[str]) -> str:
     return "".join(f"{PARTS[part]}\n" for part in parts)
 
 
-def _cells(scores: np.ndarray, sign: str = "-") -> list[str]:
-    """Return the means of scores [S, N] ± their standard deviations over the seeds, "-" if
-    unknown.
-    """
-    cells = []
-    for values in scores.T:
-        spread = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
-        cells.append("-" if np.isnan(values).any() else f"{values.mean():{sign}.2f}{spread}")
-    return cells
-
-
-def fit_arms(
-    arms: Sequence[Arm],
-    first_config: StreamConfig,
-    capture: Capture,
-    seeds: int,
-    frames: int,
-    out: Path,
-    progress: Report | None,
+def _write_result(
+    result: SweepResult, path: Path, fits: Fits, settings: Mapping[str, Any]
 ) -> SweepResult:
-    """Return the scores of some arms, fitted where they are missing. They are fitted seed by seed,
-    so that a change of the machine's load reaches all of them.
+    """Write a result as JSON, and as a plot where matplotlib is installed; return it with a
+    sentence on a busy machine.
+
+    Args:
+        result: the result so far.
+        path: of the JSON file; the plot is beside it.
+        fits: the fits so far.
+        settings: what was fitted and how.
     """
-    check_value("sweep()", "seeds", seeds, Count)
-    check_value("sweep()", "frames", frames, Annotated[int, Ge(2)])
-    capture = replace(capture, num_frames=min(frames, capture.num_frames))
-    frame = next(capture.partial_frames(0, 1))
-
-    @cache
-    def dense_capture() -> Capture:
-        return with_points(capture, first_config.seed, Progress())
-
-    @cache
-    def compile_kernels(config: StreamConfig) -> None:
-        loop = StreamLoop.of(dense_capture(), config)
-        for frame in capture.partial_frames(0, _WARM_FRAMES):
-            push_frame(loop, frame, capture.train_views)
-
-    def scores_of(folder: Path, config: StreamConfig, start: Any, fit: Callable[..., Any]) -> Any:
-        """Return the scores of a fit, made unless they are there of the same capture, settings and
-        start.
-        """
-        path = folder / "scores.json"
-        metadata = stream_metadata(capture, frame, config)
-        made = json.loads(json.dumps([metadata, start]))
-        if not path.exists() or stored_scores(path)[0] != made:
-            compile_kernels(replace(apply_values(config, _WARM), seed=0))
-            write_json(path, {"made": made, "scores": fit(folder, config, metadata)})
-        return stored_scores(path)[1]
-
-    def fit_first(folder: Path, config: StreamConfig, _: Any) -> list[list[float]]:
-        shown = []
-        begin = time.perf_counter()
-
-        def show(keyframe: Packet | None) -> None:
-            shown.append((time.perf_counter() - begin, keyframe))
-
-        stream_capture(replace(capture, num_frames=1), folder, config, on_provisional=show)
-        show(next(iter(open_stream(folder))))
-        (frame,) = ComparedClip.of(open_stream(folder), capture.path).frames()
-        curve = []
-        for seconds, keyframe in shown:
-            state = replace(frame.state, gaussians=decode(None, keyframe).gaussians)
-            views = replace(frame, state=state).views()
-            scores = [psnr(view.rendered, view.recorded, view.valid) for view in views]
-            curve.append([seconds, known_mean(scores)])
-        return curve
-
-    first_frames = []
-    scores = np.full((len(arms), seeds, len(TITLES)), np.nan)
-    fits = Progress(progress, "Fitting and evaluating")
-    total = seeds * len(arms)
-    with locked_folder(out, "sweep()"):
-        for seed in range(seeds):
-            first = out / f"first-seed{seed}"
-            curve = scores_of(first, replace(first_config, seed=seed), None, fit_first)
-            first_frames.append(curve)
-            for k, (name, config, shares_first) in enumerate(arms):
-                label = f"{name}-epochs{config.fit.epochs}-seed{seed}"
-                folder = out / label.replace(", ", "+").replace(" ", "-")
-                start = first if shares_first else None
-                fit = partial(_fit_later, capture, start, fits.part(seed * len(arms) + k, total))
-                scores[k, seed] = scores_of(folder, replace(config, seed=seed), curve, fit)
-        fits(total, total)
-    names, configs, _ = zip(*arms, strict=True)
-    epochs = [config.fit.epochs for config in configs]
-    return SweepResult(
-        capture.path.name, bool(capture.test_views), names, epochs, scores, first_frames
-    )
-
-
-def stored_scores(path: Path) -> tuple[Any, list[Any]]:
-    """Return what a fit was made of, and its scores: a number for each of `TITLES`, or the pairs of
-    `SweepResult.first_frames`.
-
-    Raises:
-        ValueError: the file has something else.
-    """
-    try:
-        document = read_json(path)
-        made = document["made"]
-        scores = document["scores"]
-        rows = np.array(scores, float)  # None is NaN
-        if rows.shape not in ((len(TITLES),), (len(scores), 2)):
-            raise ValueError(f"numbers {list(rows.shape)}")
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: expected the scores of a fit, got a broken file ({error!r}); remove it, and "
-            "the fit is made again."
-        ) from None
-    return made, scores
-
-
-def _fit_later(
-    capture: Capture,
-    first: Path | None,
-    progress: Progress,
-    folder: Path,
-    config: StreamConfig,
-    metadata: dict[str, Any],
-) -> list[float | None]:
-    """Fit an arm, from the first frame in a folder if there is one; return its scores."""
-    if first is not None:
-        begin_as(first, folder, capture, metadata)
-    stream_capture(capture, folder, config, first is not None, progress.report)
-    result = evaluate_stream(folder, capture.path)
-    progress(1, 1)
-    later = ViewScores.mean([frame.scores for frame in result.frames[1:]])
-    return [
-        result.seconds.first,
-        result.seconds.per_later_frame,
-        later.psnr,
-        later.psnr_moving,
-        later.motion_error_moving,
-        result.sizes.per_residual / 1e3,
-    ]
-
-
-def _written(
-    result: SweepResult,
-    path: Path,
-    table: Sequence[Sequence[str]],
-    sentence: str = "",
-    toml: str = "",
-) -> SweepResult:
-    """Return a result with its table, and write it as JSON with machine and versions."""
-    result = replace(result, table=table, sentence=sentence, toml=toml)
-    entries = {"titles": TITLES, "scores": result.scores.tolist()}
-    write_json(path, asdict(result) | entries | {"machine": machine(), "versions": versions()})
+    sentence = f"{result.sentence}\n{busy_sentence(fits.clocks)}".strip()
+    tables = {title: table for title, table in result.tables.items() if len(table) > 1}
+    result = replace(result, sentence=sentence, tables=tables)
+    changes = result.changes
+    document = {
+        "capture": result.capture,
+        "held_out": result.held_out,
+        "measure": result.measure,
+        "date": moment(),
+        "complete": bool(fits.calls.all()),
+        "arms": result.names.tolist(),
+        "points": result.points.tolist(),
+        "score_names": list(SCORES),
+        "scores": result.scores.tolist(),
+        "reference": result.reference.tolist(),
+        "changes": changes.mean.tolist(),
+        "standard_errors": changes.error.tolist(),
+        "deciding": DECIDING,
+        "excess": result.excess.tolist(),
+        "tables": result.tables,
+        "sentence": result.sentence,
+        "toml": result.toml,
+        "clocks": [asdict(clock) for clock in fits.clocks],
+        "settings": settings,
+        "machine": machine(),
+        "versions": versions(),
+    }
+    write_json(path, document)
+    if find_spec("matplotlib"):
+        result.plot(path.with_suffix(".png"))
     return result
