@@ -86,7 +86,7 @@ def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) ->
     low, high = (low - margin, high + margin) if score.unit == "dB" else (low, high)
     axes.set_ylim(low, high)
     axes.set_title(f"{score.label}: {title}", loc="left", fontsize="medium")
-    axes.set_xlabel(f"seconds of the {title}")
+    axes.set_xlabel(f"{title}, s")
     axes.grid(color="0.9")
     # Names beside the panel, in the order of the ends and apart from each other.
     ends.sort()
@@ -96,7 +96,9 @@ def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) ->
     for height, (y, x, label, color) in zip(heights, ends, strict=True):
         arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
         place = {"xytext": (1.03, height), "textcoords": "axes fraction", "va": "center"}
-        axes.annotate(label, (x, y), arrowprops=arrow, color=color, **place)
+        axes.annotate(
+            label.replace(" and ", "\nand "), (x, y), arrowprops=arrow, color=color, **place
+        )
 
 
 def draw_changes(result: SweepResult) -> Figure:
