@@ -142,9 +142,9 @@ def pose_problems(views: Sequence[View]) -> list[str]:
         camera = view.camera.with_width(_WIDTH)
         width = min(max(view.camera.width, _LEAST_WIDTH), _WIDTH)
         size = (width, round(width * camera.height / _WIDTH))
-        own = detect(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), view.mask)
+        detected = detect(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), view.mask)
         # In px of one size, as the limits of the errors are.
-        features.append(replace(own, points=own.points * camera.size / size))
+        features.append(replace(detected, points=detected.points * camera.size / size))
         cameras.append(replace(camera, name=camera.name or f"view {index}"))
     none = np.zeros((0, 3))
     capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
