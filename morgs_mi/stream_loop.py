@@ -21,6 +21,7 @@ import numpy as np
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import quantity
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.memory import process_memory, release_memory
@@ -264,9 +265,9 @@ class StreamLoop:
         return loop
 
     def __repr__(self) -> str:
-        count = len(self.setup.cameras)
+        cameras = quantity(len(self.setup.cameras), "camera")
         gaussians = "" if self.gaussians is None else f", {self.gaussians}"
-        return f"StreamLoop({count} cameras, frame {self.state.frame} is next{gaussians})"
+        return f"StreamLoop({cameras}, frame {self.state.frame} is next{gaussians})"
 
     @property
     def gaussians(self) -> Gaussians | None:

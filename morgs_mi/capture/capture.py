@@ -23,7 +23,7 @@ from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_points, composed, few
+from morgs_mi.core.checks import check_points, composed, few, quantity
 from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.files import CAPTURE
 from morgs_mi.core.rig import with_near_planes
@@ -126,10 +126,9 @@ class Capture:
 
     def __repr__(self) -> str:
         held_out = ", ".join(self.names[view] for view in self.test_views) or "none"
-        size = (
-            f"{len(self.cameras)} cameras, {self.num_frames} frames, {self.fps:g} frames per second"
-        )
-        return f"Capture('{self.path}', {self.layout}, {size}, held out: {held_out})"
+        cameras = quantity(len(self.cameras), "camera")
+        frames = f"{quantity(self.num_frames, 'frame')}, {self.fps:g} frames per second"
+        return f"Capture('{self.path}', {self.layout}, {cameras}, {frames}, held out: {held_out})"
 
     @property
     def names(self) -> tuple[str, ...]:

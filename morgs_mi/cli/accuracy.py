@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
@@ -28,7 +28,7 @@ class Accuracy:
     """Plot, beside which a .json has all results; by default stream-accuracy.png or
     FILE-accuracy.png beside SOURCE. Needs the extra plots.
     """
-    camera: tuple[str, ...] = ()
+    camera: Annotated[tuple[str, ...], arg(metavar="CAMERA ...")] = ()
     """Cameras by index or name; by default the first one, for a file of Gaussians the one with most
     detail in view.
     """

@@ -14,7 +14,7 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.checks import errors_at, require
+from morgs_mi.core.checks import errors_at, quantity, require
 from morgs_mi.core.files import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
@@ -99,8 +99,8 @@ def stream_path(out: str | Path) -> Path:
             refuse_foreign(path / "meta.json")
         if frames := [file.name for file in listed(path) if suffix_of(file)]:
             raise ValueError(
-                f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
-                f"one, such as {path / frames[0]}, or run `morgs-mi import`."
+                f"{path}: got a folder with {quantity(len(frames), 'file')} of Gaussians, not a "
+                f"stream; name one, such as {path / frames[0]}, or run `morgs-mi import`."
             )
     remedy = f"if {path} is a capture, fit it first: morgs-mi fit {path} OUT"
     path = path / STREAM if path.is_dir() else path
@@ -161,8 +161,8 @@ def open_stream(
         problems.append(f"the damaged frames {spans(stream.skipped)} are skipped")
     if skip_damaged and not stream.closed():
         problems.append(
-            f"it ends after {len(stream.index())} packets without an index, and may lack later "
-            "frames"
+            f"it ends after {quantity(len(stream.index()), 'packet')} without an index, and may "
+            "lack later frames"
         )
     if problems:
         _LOG.warning("%s: %s.", stream.path, "; ".join(problems))

@@ -80,11 +80,11 @@ def test_push__returns_the_buffers_of_frames_that_changed_more():
     allocated = []
     for image in (first, *others, others[-1], others[0], *[others[-1]] * 3):
         loop.push([image, image])
-        # Without anything in use, what Dr.Jit has for later.
+        # What Dr.Jit has for later, and what other tests use.
         dr.detail.malloc_clear_statistics()
         allocated.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM))
     changed, single, again, two = (allocated[k] for k in (3, 4, 6, 8))
-    assert (single, two < 0.1 * again) == (changed, True), allocated
+    assert (single, two < 0.5 * again) == (changed, True), allocated
 
 
 def test_check_memory__names_what_is_needed_and_free(monkeypatch):

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.core.checks import require
+from morgs_mi.core.checks import quantity, require
 from morgs_mi.extras.live.cameras import CameraFeed
 from morgs_mi.extras.live.live_config import LiveConfig
 from morgs_mi.io.prefetch import close_items, prefetched
@@ -108,7 +108,7 @@ def live_frames(
         ValueError: the number of sources differs from the number of cameras, or an image from the
             size of the rig's.
     """
-    cameras = f"{len(rig.cameras)} cameras ({', '.join(rig.names)})"
+    cameras = f"{quantity(len(rig.cameras), 'camera')} ({', '.join(rig.names)})"
     require(
         len(sources) == len(rig.cameras),
         "live_frames()",

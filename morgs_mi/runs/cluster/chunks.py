@@ -125,8 +125,8 @@ class ChunkedRun:
         most = max(1, num_frames // _MIN_FRAMES)
         if not 1 <= chunks.count <= most:
             raise ValueError(
-                f"ChunkedRun(): `chunks` must be 1 to {most} for {num_frames} frames, "
-                f"{_MIN_FRAMES} for each, got {chunks.count}."
+                f"ChunkedRun(): `chunks` must be 1 to {most} for "
+                f"{quantity(num_frames, 'frame')}, {_MIN_FRAMES} for each, got {chunks.count}."
             )
         # First frames of chunks of about the same length, and the number of frames.
         starts = np.linspace(0, num_frames, chunks.count + 1)
