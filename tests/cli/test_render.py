@@ -98,5 +98,5 @@ def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(stream, tmp_pa
         == 0
     )
     assert caplog.messages == [
-        f"{stream}: it ends after 1 packets without an index, and may lack later frames."
+        f"{stream}: it ends after 1 packet without an index, and may lack later frames."
     ]
