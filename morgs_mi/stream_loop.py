@@ -130,7 +130,7 @@ def step(
     report = replace(
         fitted,
         seconds=time.perf_counter() - start_time,
-        status="; ".join(filter(None, [fitted.status, *problems])) or "ok",
+        status="; ".join(filter(None, [*problems, fitted.status])) or "ok",
         missing_views=tuple(
             camera.name for v, camera in enumerate(setup.cameras) if v not in present
         ),

@@ -133,16 +133,18 @@ class Target:
         return self._places[region]
 
     def constant_error(self, region: Region | None = None) -> float:
-        """Return the mean squared error of the best image of one colour, over the valid pixels of a
+        """Return the mean squared error of the best image of one grey, over the valid pixels of a
         region; 0 without any.
         """
-        pixels = self.image()[self._valid_on(region)]
-        mean = pixels.sum(axis=0) / max(len(pixels), 1)
-        return float(np.square(pixels - mean).sum() / max(pixels.size, 1))
+        numbers = self.on(region)[0]  # 0 where they are not valid
+        count = self._num_valid(region)
+        mean = np.asarray(dr.sum(numbers)).item() / count
+        return np.asarray(dr.sum(dr.square(numbers))).item() / count - mean**2
 
-    def _valid_on(self, region: Region | None) -> np.ndarray:
-        """Return the mask of the valid pixels [H, W] of a region."""
-        return valid_pixels(self._mask, self.shape) & (region is None or region.mask)
+    def _num_valid(self, region: Region | None) -> int:
+        """Return the number of valid numbers on a region, at least 1."""
+        valid = valid_pixels(self._mask, self.shape) & (region is None or region.mask)
+        return max(3 * int(valid.sum()), 1)
 
     def windows_on(self, region: Region | None) -> _Windows:
         """Return the windows that contain the pixels of a region, or all windows of the view for
@@ -155,8 +157,8 @@ class Target:
             (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(
                 windows, height, self.pixels
             )
-            num_valid = max(3 * int(self._valid_on(region).sum()), 1)
-            self._windows[region] = _Windows(windows, count, pixels, num_valid, mean, variance)
+            numbers = self._num_valid(region)
+            self._windows[region] = _Windows(windows, count, pixels, numbers, mean, variance)
         return self._windows[region]
 
     def masked(self, values: Float, places: UInt32 | None = None) -> Float:
