@@ -198,6 +198,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
         committed("held_out")["fits"], committed("held_out_seeds")["fits"]
     ),
     "parts": parts,
+    "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     "splat_files": splat_files,
     "stages": lambda: stages.table(committed("stages")["profiles"]),

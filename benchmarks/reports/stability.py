@@ -114,13 +114,14 @@ def _fit_rows(num_frames: int) -> Iterator[Row]:
     for fit in HARD_FITS:
         start = time.perf_counter()
         frames = list(fitted(fit, min(fit.num_frames, num_frames)))
+        sentences = [status for *_, status in frames if status != "ok"]
         yield {
             "kind": "fit",
             "name": fit.name,
             "frames": len(frames),
             "psnr": [frames[0][0], frames[-1][0]],
             "finite": all(np.isfinite(v).all() for _, raw, _ in frames for v in raw.values()),
-            "sentence": frames[0][2],
+            "sentence": sentences[0] if sentences else "",
             "seconds": time.perf_counter() - start,
         }
 
@@ -134,6 +135,18 @@ def stability_table(rows: Sequence[Row]) -> str:
             gradients = (row.get(name, 0) for row in group for name in ATTRIBUTES)
             lines.append((kind, f"{image:.0e}", f"{max(gradients):.0e}"))
     return markdown(("kind", "image", "gradients"), lines)
+
+
+def fits_table(rows: Sequence[Row]) -> str:
+    """Return the PSNR of the first and the last frame of each hard recording, and what is said."""
+    lines = []
+    for row in rows:
+        if row["kind"] == "fit":
+            first, last = row["psnr"]
+            sentence = row["sentence"] or "-"
+            lines.append((row["name"], str(row["frames"]), f"{first:.1f}", f"{last:.1f}", sentence))
+    columns = ("recording", "frames", "first, dB", "last, dB", "first status")
+    return markdown(columns, lines)
 
 
 def condition_plot(rows: Sequence[Row]) -> Figure:

@@ -210,7 +210,8 @@ CASES_BY_KIND = {
     ],
     "aspects up to 1e9": [*NEEDLES.values()][:-1],
     "distances up to 1e5": [*DISTANCES.values()][:6],
-    "beyond float32": [*NEEDLES.values()][-1:] + [*DISTANCES.values()][6:],
+    "aspect of 1e10, distances from 1e6 to 1e10": [*NEEDLES.values()][-1:]
+    + [*DISTANCES.values()][6:],
     "scales": [
         case("sub-pixel splats", scales=(1e-6, 2e-6, 3e-6)),
         case("screen-filling splats", scales=(50, 70, 90)),
