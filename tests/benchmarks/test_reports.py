@@ -33,6 +33,7 @@ REPORTS = {
     "field": FIELD,
     "held_out": "CLIPS/fit",
     "method": f"{STREAM} --num-gaussians 60 {METHOD}",
+    "needed": "--sets random-41 --clips CLIPS --recordings CLIPS --most 4",
     "random_scenes": f"{SEED} --frames 2",
     "real": "--captures CLIPS/random-1 --gaussians 60 --steps 3 --width 48 --pictures OUT",
     "renderer": "--gaussians 400 --width 48 --height 32 --plot OUT/a.png",
@@ -47,7 +48,7 @@ def clips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
     size = SynthConfig(cameras=5, frames=3, width=48, height=36, spp=1)
     clip = synthesize("spheres", folder / "random-1", size)
-    for name in ("random-1-one-clock-3x48", "random-1-apart-3x48", "spheres-3x48"):
+    for name in ("random-41", "random-1-one-clock-3x48", "random-1-apart-3x48", "spheres-3x48"):
         (folder / name).symlink_to(clip)
     (folder / "random-1-lens-0.1").symlink_to(clip)
     stream_capture(load_capture(clip), folder / "fit", quick())
