@@ -12,6 +12,7 @@ from benchmarks.reports import (
     codec,
     field,
     held_out,
+    needed,
     random_scenes,
     renderer,
     stability,
@@ -184,6 +185,11 @@ def step_parts() -> str:
     return markdown(("", "20k Gaussians, 512x384", "100k Gaussians, 1352x1014"), rows.values())
 
 
+def trial_table(table: Callable[..., str]) -> str:
+    """Return a table of the trial of branches."""
+    return table(needed.rows_of(committed("what_is_needed")))
+
+
 TABLES: Mapping[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "cameras": partial(study_table, cameras, "cameras"),
@@ -204,5 +210,13 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "stages": lambda: stages.table(committed("stages")["profiles"]),
     "step_parts": step_parts,
     "steps": steps,
+    **{
+        f"trial_{name}": partial(trial_table, table)
+        for name, table in (
+            ("branches", needed.branches_table),
+            ("groups", needed.groups_table),
+            ("sets", needed.sets_table),
+        )
+    },
     "unseen": partial(study_table, random_scenes, "random_scenes"),
 }

@@ -199,10 +199,16 @@ def run_trial(
         rows.append(row)
         print(f"{place}, seed {seed}, without {', '.join(off) or 'nothing'}: {scores}", flush=True)
         if path is not None:
-            document = {"fits": [*others, *rows], "code": code, "commit": commit()}
+            document = {"fits": [*others, *rows], "code": None if any_commit else code}
+            document["commit"] = commit()
             document |= {"date": date.today().isoformat(), "machine": machine()}
             write_json(path, document | {"versions": versions()})
     return rows
+
+
+def rows_of(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the rows that count of a JSON of `run_trial`: of the code that made the last ones."""
+    return [row for row in document["fits"] if document["code"] in (None, row["code"])]
 
 
 class Opened:
@@ -341,7 +347,8 @@ def reason(place: str, trial: Trial | None) -> str:
     change = f"{loss.change:+.2f} {loss.measure.title}"
     if loss.measure.is_relative:
         change = f"{100 * loss.change:+.1f} % {loss.measure.title}"
-    return f"{place}: {change}, {quantity(trial.seeds, 'seed')}"
+    others = f" with {quantity(trial.count - 1, 'other')}" if trial.count > 1 else ""
+    return f"{place}{others}: {change}, {quantity(trial.seeds, 'seed')}"
 
 
 def groups_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -352,7 +359,8 @@ def groups_table(rows: Sequence[Mapping[str, Any]]) -> str:
         if len(names) > 1:
             parts = {branch.group for branch in BRANCHES if branch.name in names}
             title = parts.pop() if len(parts) == 1 else "all that are not needed"
-            lines.append((place, title, f"{len(names)}", trial.state, reason("", trial)[2:]))
+            loss = reason("", trial).partition(": ")[2]
+            lines.append((place, title, f"{len(names)}", trial.state, loss))
     return markdown(("set", "group", "branches", "state", "largest loss"), lines, left=2)
 
 

@@ -80,6 +80,7 @@ class Trial:
     state: State  #: Of these branches on this set.
     loss: Loss  #: The largest loss.
     seeds: int  #: Number of pairs.
+    count: int  #: Number of branches that are off.
 
 
 def numbers(rows: Sequence[Row], name: str) -> np.ndarray:
@@ -130,17 +131,18 @@ def is_slower(default: Sequence[Row], without: Sequence[Row]) -> bool:
 def compared(default: Sequence[Row], without: Sequence[Row], every: Sequence[Row]) -> Trial:
     """Return the comparison of paired fits; arguments of `losses`."""
     seeds = len(without)
+    count = len(without[0]["off"])
     if all(a["stream"] == b["stream"] for a, b in zip(default, without, strict=True)):
-        return Trial("no effect", Loss(MEASURES[1], 0.0, 0.0), seeds)
+        return Trial("no effect", Loss(MEASURES[1], 0.0, 0.0), seeds, count)
     largest = max(
         losses(default, without, every),
         key=lambda loss: (loss.is_clear and not loss.is_little, loss.is_clear, loss.tolerances),
     )
     if largest.is_clear or (largest.tolerances > 1 and seeds == len(SEEDS)):
-        return Trial("needed by little" if largest.is_little else "needed", largest, seeds)
+        return Trial("needed by little" if largest.is_little else "needed", largest, seeds, count)
     if largest.tolerances > 1:
-        return Trial("close", largest, seeds)
-    return Trial("slower" if is_slower(default, without) else "not needed", largest, seeds)
+        return Trial("close", largest, seeds, count)
+    return Trial("slower" if is_slower(default, without) else "not needed", largest, seeds, count)
 
 
 Trials = Mapping[tuple[str, tuple[str, ...]], Trial]

@@ -14,6 +14,7 @@ from benchmarks.reports.needed import (
     branches_table,
     code_hash,
     groups_table,
+    rows_of,
     run_trial,
     sets_table,
 )
@@ -227,7 +228,10 @@ def test_run_trial__continues_fit_by_fit_and_by_code(tmp_path):
     write_json(path, {"fits": others})
     assert run_trial(path, GROUPS, fit, any_commit=True) == others
     assert run_trial(path, GROUPS, fit, most=1)[0]["code"] == code_hash()
-    assert read_json(path)["fits"][:-1] == others
+    document = read_json(path)
+    assert document["fits"][:-1] == others
+    assert rows_of(document) == document["fits"][-1:]
+    assert rows_of({**document, "code": None}) == document["fits"]
 
 
 def test_tables__have_every_branch_and_set():
