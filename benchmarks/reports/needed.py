@@ -375,8 +375,11 @@ def sets_table(rows: Sequence[Mapping[str, Any]]) -> str:
         for measure in MEASURES:
             scores = numbers(defaults, measure.name)
             factor = 1e-3 if measure.name == "bytes" else 1
+            digits = 3 if measure.name == "motion_error" else 2
             is_known = len(scores) > 0 and np.isfinite(scores).all()
-            cells.append(plus_minus([factor * score for score in scores]) if is_known else "-")
+            cells.append(
+                plus_minus([factor * score for score in scores], digits) if is_known else "-"
+            )
         counts = f"{recording.frames}", f"{len(fits)}", f"{len(tried)}"
         lines.append((name, *counts, *cells))
     titles = "set", "frames", "fits", "branches alone", "first, dB", "later, dB"

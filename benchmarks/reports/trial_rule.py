@@ -12,10 +12,11 @@ tolerances of its measure:
 - seconds: 3 % in wall and processor time, where both differences exceed twice their standard
   errors. A machine's clock is noisy, so they never decide alone.
 
-Without a branch that a set needs, a loss exceeds its tolerance; with one seed it must be clear,
-that is, exceed twice its tolerance and twice its noise. A gain is no reason to have a branch. Seeds
-vary little in some sets: a loss above its noise, but of at most 0.1 dB where things move or 3 % of
-the motion's error, is *little*, and such branches are tried on further sets.
+Without a branch that a set needs, a loss exceeds its tolerance with three seeds. With one seed it
+must be *clear*: twice its noise, and twice 0.1 dB or 3 %; others that exceed their tolerance get
+further seeds. A gain is no reason to have a branch. Seeds vary little in some sets: a loss above
+its noise, but of at most 0.1 dB where things move or 3 % of the motion's error, is *little*, and
+such branches are tried on further sets.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import numpy as np
 
 Row = Mapping[str, Any]
 SEEDS = (0, 1, 2)
-# A loss is clear above so many tolerances and standard deviations of its noise.
+# A loss is clear above so many standard deviations of its noise, and so many times what is little.
 _CLEAR = 2.0
 _COST = 0.03  # of bytes and seconds, relative
 _PSNR = 0.1  # dB
@@ -109,7 +110,7 @@ def losses(default: Sequence[Row], without: Sequence[Row], every: Sequence[Row])
         tolerance = noise if measure.has_noise else measure.little
         loss = -measure.gain * change
         if np.isfinite(loss) and np.isfinite(noise):
-            is_clear = loss > _CLEAR * max(tolerance, noise)
+            is_clear = loss > _CLEAR * max(measure.little, noise)
             ratio = loss / max(tolerance, 1e-9)
             result.append(Loss(measure, change, ratio, is_clear, loss <= measure.little))
     return result
@@ -136,9 +137,13 @@ def compared(default: Sequence[Row], without: Sequence[Row], every: Sequence[Row
         return Trial("no effect", Loss(MEASURES[1], 0.0, 0.0), seeds, count)
     largest = max(
         losses(default, without, every),
-        key=lambda loss: (loss.is_clear and not loss.is_little, loss.is_clear, loss.tolerances),
+        key=lambda loss: (
+            loss.tolerances > 1 and not loss.is_little,
+            loss.is_clear,
+            loss.tolerances,
+        ),
     )
-    if largest.is_clear or (largest.tolerances > 1 and seeds == len(SEEDS)):
+    if largest.is_clear or (largest.tolerances > 1 and seeds >= len(SEEDS)):
         return Trial("needed by little" if largest.is_little else "needed", largest, seeds, count)
     if largest.tolerances > 1:
         return Trial("close", largest, seeds, count)
@@ -223,7 +228,8 @@ def next_fit(
         survivors = tuple(name for names in candidates for name in names)
         for name in survivors:
             trial = trials.get((place, (name,)))
-            if trial is not None and trial.state == "close":
+            has_more = trial is not None and (trial.state == "close" or trial.seeds > 1)
+            if trial is not None and has_more and trial.seeds < len(SEEDS):
                 return place, (name,), SEEDS[trial.seeds]
         if len(survivors) > 1 and not any(company >= {*survivors} for company in companies):
             return place, survivors, SEEDS[0]
