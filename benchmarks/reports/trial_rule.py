@@ -199,7 +199,7 @@ def next_fit(
 
     On one set after the other: the default with three seeds; each group of branches that no set
     needs so far; each branch of a group that this set needs; further seeds where it is close; and
-    all branches together that are not needed.
+    all branches together that are not needed, with further seeds where these are close.
 
     Args:
         rows: fits so far.
@@ -214,13 +214,13 @@ def next_fit(
         candidates = [
             [name for name in names if not is_needed(trials, name)] for names in groups_of_place
         ]
-        companies = [{*names} for where, names in trials if where == place and len(names) > 1]
+        companies = [names for where, names in trials if where == place and len(names) > 1]
         untried = [
             [name for name in names if trial_on(trials, name, place) is None]
             for names in candidates
         ]
         for names in untried:
-            if len(names) > 1 and not any(company >= {*names} for company in companies):
+            if len(names) > 1 and not any({*company} >= {*names} for company in companies):
                 return place, tuple(names), SEEDS[0]
         for names in untried:
             if names:
@@ -231,8 +231,13 @@ def next_fit(
             has_more = trial is not None and (trial.state == "close" or trial.seeds > 1)
             if trial is not None and has_more and trial.seeds < len(SEEDS):
                 return place, (name,), SEEDS[trial.seeds]
-        if len(survivors) > 1 and not any(company >= {*survivors} for company in companies):
+        joint = [names for names in companies if {*names} >= {*survivors}]
+        if len(survivors) > 1 and not joint:
             return place, survivors, SEEDS[0]
+        for names in joint:
+            trial = trials[place, names]
+            if trial.state == "close":
+                return place, names, SEEDS[trial.seeds]
     return None
 
 
