@@ -84,11 +84,12 @@ class Recording:
 
     @property
     def groups(self) -> list[list[str]]:
-        """The names of the branches that act on it, group by group."""
-        return [
-            [b.name for b in BRANCHES if b.group == group and acts_on(b, self)]
-            for group in groups()
-        ]
+        """The names of the branches that act on it, group by group; those last that act on the
+        first frame, whose fits take longest.
+        """
+        members = [[b for b in BRANCHES if b.group == group] for group in groups()]
+        members.sort(key=lambda group: any(branch.in_first for branch in group))
+        return [[branch.name for branch in group if acts_on(branch, self)] for group in members]
 
 
 def acts_on(branch: Branch, recording: Recording) -> bool:

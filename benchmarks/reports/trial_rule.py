@@ -12,11 +12,11 @@ tolerances of its measure:
 - seconds: 3 % in wall and processor time, where both differences exceed twice their standard
   errors. A machine's clock is noisy, so they never decide alone.
 
-Without a branch that a set needs, a loss exceeds its tolerance with three seeds. With one seed it
-must be *clear*: twice its noise, and twice 0.1 dB or 3 %; others that exceed their tolerance get
-further seeds. A gain is no reason to have a branch. Seeds vary little in some sets: a loss above
-its noise, but of at most 0.1 dB where things move or 3 % of the motion's error, is *little*, and
-such branches are tried on further sets.
+Without a branch that a set needs, a loss exceeds its tolerance and twice its noise with three
+seeds. With one seed it must be *clear*: twice its noise, and twice 0.1 dB or 3 %; others that
+exceed their tolerance get further seeds, and may stay undecided. A gain is no reason to have a
+branch. Seeds vary little in some sets: a loss above its noise, but of at most 0.1 dB where things
+move or 3 % of the motion's error, is *little*, and such branches are tried on further sets.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ class Loss:
     measure: Measure  #: The measure.
     change: float  #: Mean difference, in the measure's unit or relative.
     tolerances: float  #: The same as a loss, in tolerances.
+    is_certain: bool = False  #: Whether it exceeds twice its noise.
     is_clear: bool = False  #: Whether it is so large that further seeds are no help.
     is_little: bool = True  #: Whether nobody sees it.
 
@@ -110,9 +111,11 @@ def losses(default: Sequence[Row], without: Sequence[Row], every: Sequence[Row])
         tolerance = noise if measure.has_noise else measure.little
         loss = -measure.gain * change
         if np.isfinite(loss) and np.isfinite(noise):
-            is_clear = loss > _CLEAR * max(measure.little, noise)
+            is_certain = loss > _CLEAR * noise
+            is_clear = is_certain and loss > _CLEAR * measure.little
+            is_little = loss <= measure.little
             ratio = loss / max(tolerance, 1e-9)
-            result.append(Loss(measure, change, ratio, is_clear, loss <= measure.little))
+            result.append(Loss(measure, change, ratio, is_certain, is_clear, is_little))
     return result
 
 
@@ -138,16 +141,18 @@ def compared(default: Sequence[Row], without: Sequence[Row], every: Sequence[Row
     largest = max(
         losses(default, without, every),
         key=lambda loss: (
+            loss.tolerances > 1 and not loss.is_little and loss.is_certain,
             loss.tolerances > 1 and not loss.is_little,
-            loss.is_clear,
+            loss.is_certain,
             loss.tolerances,
         ),
     )
-    if largest.is_clear or (largest.tolerances > 1 and seeds >= len(SEEDS)):
-        return Trial("needed by little" if largest.is_little else "needed", largest, seeds, count)
     if largest.tolerances > 1:
-        return Trial("close", largest, seeds, count)
-    return Trial("slower" if is_slower(default, without) else "not needed", largest, seeds, count)
+        is_decided = largest.is_clear or (seeds >= len(SEEDS) and largest.is_certain)
+        state = "needed by little" if largest.is_little else "needed"
+        return Trial(state if is_decided else "close", largest, seeds, count)
+    state = "slower" if is_slower(default, without) else "not needed"
+    return Trial(state, largest, seeds, count)
 
 
 Trials = Mapping[tuple[str, tuple[str, ...]], Trial]
@@ -236,7 +241,7 @@ def next_fit(
             return place, survivors, SEEDS[0]
         for names in joint:
             trial = trials[place, names]
-            if trial.state == "close":
+            if trial.state == "close" and trial.seeds < len(SEEDS):
                 return place, names, SEEDS[trial.seeds]
     return None
 
@@ -265,7 +270,7 @@ def verdict(trials: Trials, name: str, places: Sequence[str]) -> tuple[str, str,
     words = {
         "needed": "kept",
         "needed by little": f"kept by little on {tried}",
-        "close": "needs more seeds",
+        "close": "needs more seeds" if results[place].seeds < len(SEEDS) else "undecided",
         "slower": "needs a quiet machine",
         "not needed": "goes" if len(results) == len(places) else f"not needed on {tried}",
         "no effect": f"no effect on {tried}",
