@@ -359,7 +359,7 @@ def groups_table(rows: Sequence[Mapping[str, Any]]) -> str:
     for (place, names), trial in trials.items():
         if len(names) > 1:
             parts = {branch.group for branch in BRANCHES if branch.name in names}
-            title = parts.pop() if len(parts) == 1 else "all that are not needed"
+            title = parts.pop() if len(parts) == 1 else quantity(len(parts), "group")
             loss = reason("", trial).partition(": ")[2]
             lines.append((place, title, f"{len(names)}", trial.state, loss))
     return markdown(("set", "group", "branches", "state", "largest loss"), lines, left=2)

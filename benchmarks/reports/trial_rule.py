@@ -31,6 +31,8 @@ Row = Mapping[str, Any]
 SEEDS = (0, 1, 2)
 # A loss is clear above so many standard deviations of its noise, and so many times what is little.
 _CLEAR = 2.0
+# Least number of branches, needed together, whose halves are tried.
+_LEAST_SPLIT = 10
 _COST = 0.03  # of bytes and seconds, relative
 _PSNR = 0.1  # dB
 
@@ -204,7 +206,7 @@ def next_fit(
 
     On one set after the other: the default with three seeds; each group of branches that no set
     needs so far; each branch of a group that this set needs; further seeds where it is close; and
-    all branches together that are not needed, with further seeds where these are close.
+    all branches together that are not needed, or halves of them.
 
     Args:
         rows: fits so far.
@@ -236,14 +238,32 @@ def next_fit(
             has_more = trial is not None and (trial.state == "close" or trial.seeds > 1)
             if trial is not None and has_more and trial.seeds < len(SEEDS):
                 return place, (name,), SEEDS[trial.seeds]
-        joint = [names for names in companies if {*names} >= {*survivors}]
-        if len(survivors) > 1 and not joint:
-            return place, survivors, SEEDS[0]
-        for names in joint:
-            trial = trials[place, names]
-            if trial.state == "close" and trial.seeds < len(SEEDS):
-                return place, names, SEEDS[trial.seeds]
+        joint = [names for names in companies if {*names} >= {*survivors}] or [survivors]
+        pending = untried_part(trials, place, joint[0])
+        if pending is not None:
+            return pending
     return None
+
+
+def untried_part(
+    trials: Trials, place: str, names: tuple[str, ...]
+) -> tuple[str, tuple[str, ...], int] | None:
+    """Return the set, the branches and the seed of the next fit without several branches together:
+    of all, with further seeds where these are close, or of a half of those that are needed
+    together; None: all are made.
+    """
+    if len(names) < 2:
+        return None
+    trial = trials.get((place, names))
+    if trial is None:
+        return place, names, SEEDS[0]
+    if trial.state == "close" and trial.seeds < len(SEEDS):
+        return place, names, SEEDS[trial.seeds]
+    if trial.state in ("no effect", "not needed", "slower") or len(names) < _LEAST_SPLIT:
+        return None
+    middle = len(names) // 2
+    halves = (untried_part(trials, place, part) for part in (names[:middle], names[middle:]))
+    return next(filter(None, halves), None)
 
 
 def verdict(trials: Trials, name: str, places: Sequence[str]) -> tuple[str, str, Trial | None]:
