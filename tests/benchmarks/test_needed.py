@@ -213,6 +213,17 @@ def test_next_fit__groups_first_then_single_ones_then_seeds_then_all_together():
     assert next_fit(rows, GROUPS) is None
 
 
+def test_next_fit__halves_of_branches_that_stand_in_for_each_other():
+    names = tuple("abcdefghijkl")
+
+    def fit(place, off, seed):
+        scores = row(off, seed, place, psnr_later=-float({"a", "l"} <= {*off}))
+        return {name: scores[name] for name in scores.keys() - {"set", "off", "seed", "code"}}
+
+    rows = run_trial(None, {"a": [names]}, fit)
+    assert [tuple(r["off"]) for r in rows if len(r["off"]) > 1] == [names, names[:6], names[6:]]
+
+
 def test_run_trial__continues_fit_by_fit_and_by_code(tmp_path):
     path = tmp_path / "fits.json"
     count = 0
