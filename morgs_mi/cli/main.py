@@ -70,7 +70,7 @@ COMMANDS = {
 
 # Options that went, and what to do instead.
 OLD_OPTIONS = {
-    "--animation": "went: scene files pose meshes by functions of the time (docs/scenes.md)",
+    "--animation": "went: scene files pose meshes by functions of the time, see the page on scenes",
     "--color": "went: --exposure balances the cameras",
     "--completion": "is now --tyro-write-completion bash FILE",
     "--deep": "went: `info` checks the poses, and --time finds the time offsets",
