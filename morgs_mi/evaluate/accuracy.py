@@ -221,24 +221,36 @@ class Accuracy:
         figure = Figure((10, 4), layout="constrained")
         with context("tableau-colorblind10"):
             panels = figure.subplots(1, 2)
+        ends: list[list[tuple[float, float, str, str]]] = [[], []]
         for name, group in groupby(self.rows, lambda row: row.name.split(",")[0]):
             rows = list(group)
             seconds, image, *gradients = np.transpose(
                 [(row.seconds, *row.errors.values()) for row in rows]
             )
-            for axes, errors in zip(panels, (image, np.max(gradients, axis=0)), strict=True):
-                (line,) = axes.plot(seconds, errors, "o-")
-                end = seconds[-1], errors[-1]
-                color = line.get_color()
-                axes.annotate(name, end, (6, -3), textcoords="offset points", color=color)
+            for k, errors in enumerate((image, np.max(gradients, axis=0))):
+                (line,) = panels[k].plot(seconds, errors, "o-")
+                ends[k].append((errors[-1], seconds[-1], name, line.get_color()))
                 for row, *point in zip(rows, seconds, errors, strict=True):
                     if row.config == self.base:
-                        axes.plot(*point, "ko", markersize=11, fillstyle="none")
-        for axes, title in zip(panels, ("image", "worst gradient"), strict=True):
+                        panels[k].plot(*point, "ko", markersize=11, fillstyle="none")
+        for axes, title, names in zip(panels, ("image", "worst gradient"), ends, strict=True):
             axes.axhline(self.tolerance, color="0.8", linestyle=":")
             axes.set(xlabel="seconds of an image and its gradients", ylabel="relative error")
             axes.set(yscale="log", title=title)
-            axes.margins(x=0.15)
+            # Beside the panel, in the order of the ends, which may coincide.
+            for k, (error, second, name, color) in enumerate(sorted(names)):
+                place = (1.03, (k + 0.5) / len(names))
+                arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
+                axes.annotate(
+                    name,
+                    (second, error),
+                    place,
+                    "data",
+                    "axes fraction",
+                    arrow,
+                    color=color,
+                    va="center",
+                )
         figure.suptitle(
             f"{scene}, {quantity(self.cameras, 'camera')}, {machine()['processor']}\n"
             "names: alpha_min, along each line stop_transmittance 1e-2, 1e-4 and 1e-6; "
