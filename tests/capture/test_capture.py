@@ -283,7 +283,7 @@ def test_load_capture__describes_the_folders_that_photos_lack(tmp_path):
     cv2.imwrite(str(tmp_path / "IMG_1.png"), frames(0)[0])
     with pytest.raises(
         FileNotFoundError,
-        match=r"run `morgs-mi calibrate`.* The 1 photos .* one folder per camera: c",
+        match=r"run `morgs-mi calibrate`.* Photos count .*\(1\); .* one folder per camera: c",
     ):
         load_capture(tmp_path)
     with pytest.raises(

@@ -48,7 +48,7 @@ def find_reader(path: Path) -> Reader:
     clips = required_clips(path)  # without clips the path itself is likely wrong
     static = all(isinstance(clip, tuple) for clip in clips.values())
     recording = (
-        f" The {len(clips)} photos count as cameras with one frame each; a recording has {EXAMPLE}"
+        f" Photos count as cameras with one frame each ({len(clips)}); a recording has {EXAMPLE}"
     )
     *files, last = [file for reader in READERS for file in reader.files]
     raise FileNotFoundError(
