@@ -285,7 +285,7 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoS
     existing_file(path, "a video file")
     try:
         # A colon in the path would name a protocol.
-        container = av.open(f"file:{path}", options=_CONTAINERS)
+        container = av.open(f"file:{path}", options=_CONTAINERS, metadata_errors="replace")
     except FFmpegError as error:
         raise _unreadable(path, str(error.strerror)) from None
     with container:

@@ -357,6 +357,14 @@ def test_video_reader__takes_a_colon_as_part_of_a_path(tmp_path, monkeypatch):
     assert open_frames("12:30:00/a.mkv").num_frames == COUNT
 
 
+def test_video_reader__reads_a_video_with_broken_texts(tmp_path):
+    write_video(tmp_path / "a.mkv", clip(), 30)
+    data = (tmp_path / "a.mkv").read_bytes()
+    assert b"ENCODER" in data
+    (tmp_path / "a.mkv").write_bytes(data.replace(b"ENCODER", b"ENCO\xc4ER"))
+    assert_array_equal(list(VideoReader.open(tmp_path / "a.mkv").frames()), clip())
+
+
 def test_video_reader__names_an_unknown_codec(tmp_path):
     write_timed_video(tmp_path / "a.mp4", smooth_clip(), range(0, 240, 40), "libx264")
     data = (tmp_path / "a.mp4").read_bytes()
