@@ -300,7 +300,7 @@ def scores_of(
 
 
 def summary(frames: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Return the scores of a fit from those of its frames, the first one first.
+    """Return the scores of a fit, given the scores of its frames in order.
 
     Seconds are the least of the later frames, because the first fit of a kind compiles its kernels.
     """

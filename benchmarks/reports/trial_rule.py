@@ -50,7 +50,7 @@ class Measure:
     name: str  #: In a row.
     title: str  #: In tables, with its unit.
     gain: int  #: 1 if more is better, -1 if less is.
-    little: float  #: Loss that nobody sees.
+    little: float  #: Largest loss that counts as little.
     is_relative: bool = False  #: Whether differences are shares of the default's score.
     has_noise: bool = False  #: Whether its tolerance is the noise; otherwise it is `little`.
 
@@ -74,7 +74,7 @@ class Loss:
     tolerances: float  #: The same as a loss, in tolerances.
     is_certain: bool = False  #: Whether it exceeds twice its noise.
     is_clear: bool = False  #: Whether it is so large that further seeds are no help.
-    is_little: bool = True  #: Whether nobody sees it.
+    is_little: bool = True  #: Whether it is at most the measure's `little`.
 
 
 @dataclass(frozen=True)

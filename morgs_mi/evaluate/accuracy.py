@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from io import StringIO
-from itertools import groupby, product
+from itertools import product
 from math import isqrt
 from operator import mul
 from pathlib import Path
@@ -31,7 +31,7 @@ from morgs_mi.core.checks import check_number, quantity, require
 from morgs_mi.core.config import config_or_default
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.plots import check_plot, save_plot
+from morgs_mi.core.plots import check_plot, label_ends, save_plot
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.types import Arrays
 from morgs_mi.render.rasterize import rasterize
@@ -150,6 +150,11 @@ class Setting:
         """Largest error."""
         return max(self.errors.values())
 
+    @property
+    def gradient_error(self) -> float:
+        """Largest error of a gradient."""
+        return max(error for name, error in self.errors.items() if name != "image")
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -157,14 +162,14 @@ class Accuracy:
 
     rows: tuple[Setting, ...]
     tolerance: float  #: Largest error of the image and of every gradient.
-    cameras: int  #: Number of cameras.
+    num_cameras: int  #: Number of cameras.
     config: RenderConfig | None  #: The chosen one, see `chosen`; None if there is none.
     base: RenderConfig  #: The configuration whose settings are varied.
 
     @property
     def sentence(self) -> str:
         """The choice in words."""
-        where = f"in {quantity(self.cameras, 'camera')}"
+        where = f"in {quantity(self.num_cameras, 'camera')}"
         for row in self.rows:
             if row.config == self.config:
                 return (
@@ -221,38 +226,27 @@ class Accuracy:
         figure = Figure((10, 4), layout="constrained")
         with context("tableau-colorblind10"):
             panels = figure.subplots(1, 2)
-        ends: list[list[tuple[float, float, str, str]]] = [[], []]
-        for name, group in groupby(self.rows, lambda row: row.name.split(",")[0]):
-            rows = list(group)
-            seconds, image, *gradients = np.transpose(
-                [(row.seconds, *row.errors.values()) for row in rows]
-            )
-            for k, errors in enumerate((image, np.max(gradients, axis=0))):
-                (line,) = panels[k].plot(seconds, errors, "o-")
-                ends[k].append((errors[-1], seconds[-1], name, line.get_color()))
-                for row, *point in zip(rows, seconds, errors, strict=True):
-                    if row.config == self.base:
-                        panels[k].plot(*point, "ko", markersize=11, fillstyle="none")
-        for axes, title, names in zip(panels, ("image", "worst gradient"), ends, strict=True):
+        seconds = np.array([row.seconds for row in self.rows])
+        curves = np.array([row.name.split(",")[0] for row in self.rows])
+        base = np.array([row.config == self.base for row in self.rows])
+        errors_by_title = {
+            "image": np.array([row.errors["image"] for row in self.rows]),
+            "worst gradient": np.array([row.gradient_error for row in self.rows]),
+        }
+        for axes, (title, errors) in zip(panels, errors_by_title.items(), strict=True):
             axes.axhline(self.tolerance, color="0.8", linestyle=":")
             axes.set(xlabel="seconds of an image and its gradients", ylabel="relative error")
             axes.set(yscale="log", title=title)
-            # Beside the panel, in the order of the ends, which may coincide.
-            for k, (error, second, name, color) in enumerate(sorted(names)):
-                place = (1.03, (k + 0.5) / len(names))
-                arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
-                axes.annotate(
-                    name,
-                    (second, error),
-                    place,
-                    "data",
-                    "axes fraction",
-                    arrow,
-                    color=color,
-                    va="center",
-                )
+            ends = []
+            for name in dict.fromkeys(curves.tolist()):
+                rows = curves == name
+                (line,) = axes.plot(seconds[rows], errors[rows], "o-")
+                end = (seconds[rows][-1], errors[rows][-1])
+                ends.append((name, end, line.get_color()))
+            axes.plot(seconds[base], errors[base], "ko", markersize=11, fillstyle="none")
+            label_ends(axes, ends)
         figure.suptitle(
-            f"{scene}, {quantity(self.cameras, 'camera')}, {machine()['processor']}\n"
+            f"{scene}, {quantity(self.num_cameras, 'camera')}, {machine()['processor']}\n"
             "names: alpha_min, along each line stop_transmittance 1e-2, 1e-4 and 1e-6; "
             "ring: as given",
             fontsize="medium",
@@ -304,7 +298,7 @@ class _Sample:
 
 def accuracy(
     gaussians: Gaussians,
-    cameras: Camera | Any | Sequence[Camera | Any],
+    cameras: Camera | mi.Sensor | Sequence[Camera | mi.Sensor],
     config: RenderConfig | None = None,
     tolerance: float = 1e-3,
     progress: Report | None = None,

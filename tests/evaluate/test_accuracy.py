@@ -89,7 +89,7 @@ def test_accuracy__counts_the_worst_of_several_cameras(few_settings):
     other = replace(camera, K=camera.K * [[3, 1, 1], [1, 3, 1], [1, 1, 1]])
     both = accuracy(gaussians, [camera, other])
     worst = [accuracy(gaussians, view).rows for view in (camera, other)]
-    assert both.cameras == 2
+    assert both.num_cameras == 2
     for k, setting in enumerate(both.rows):
         errors = [rows[k].errors["image"] for rows in worst]
         assert setting.errors["image"] == pytest.approx(max(errors), rel=0.5)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from morgs_mi.core.plots import label_ends
 from morgs_mi.extras.sweep.report import AXES, select_names
 from morgs_mi.extras.sweep.statistics import DECIDING, INDEX, SCORES, mean_of
 
@@ -30,8 +31,6 @@ _FRAME = 1.4  # of titles and axes
 # Least range of an axis of PSNR, dB, and least ratio of the ends of an axis of seconds.
 _LEAST_DB = 3.0
 _LEAST_RATIO = 6.0
-# Least distance of two names, as a share of the height of a panel.
-_DISTANCE = 0.08
 # Standard errors of the bars of changes: those that a decisive change exceeds.
 _BARS = 2
 
@@ -73,7 +72,7 @@ def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) ->
         for k in rows:
             place = {"xytext": (0, 5), "textcoords": "offset points", "fontsize": 7}
             axes.annotate(result.points[k], points[k], color=color, **place)
-        ends.append((*points[rows[-1]][::-1], label, color))
+        ends.append((label.replace(" and ", "\nand "), tuple(points[rows[-1]]), color))
     axes.set_xscale("log", subs=[2, 5])
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("{x:g}")
@@ -88,17 +87,7 @@ def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) ->
     axes.set_title(f"{score.label}: {title}", loc="left", fontsize="medium")
     axes.set_xlabel(f"{title}, s")
     axes.grid(color="0.9")
-    # Names beside the panel, in the order of the ends and apart from each other.
-    ends.sort()
-    shifts = _DISTANCE * np.arange(len(ends))
-    heights = (np.array([end[0] for end in ends]) - low) / (high - low) - shifts
-    heights = np.maximum.accumulate(np.minimum(heights, 1 - shifts[-1])) + shifts
-    for height, (y, x, label, color) in zip(heights, ends, strict=True):
-        arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "relpos": (0, 0.5)}
-        place = {"xytext": (1.03, height), "textcoords": "axes fraction", "va": "center"}
-        axes.annotate(
-            label.replace(" and ", "\nand "), (x, y), arrowprops=arrow, color=color, **place
-        )
+    label_ends(axes, ends)
 
 
 def draw_changes(result: SweepResult) -> Figure:
