@@ -15,7 +15,8 @@ from morgs_mi.capture.masks import scaled_mask, used_in_clip
 from morgs_mi.capture.timeline import ClipTimes
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, display_image, encode_light
-from morgs_mi.io.video import FrameReader, ImageOrError
+from morgs_mi.io.clip_readers import FrameReader
+from morgs_mi.io.images import ImageOrError
 
 
 @dataclass(frozen=True)

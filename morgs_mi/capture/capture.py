@@ -27,8 +27,9 @@ from morgs_mi.core.checks import check_points, composed, few, quantity
 from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.files import CAPTURE
 from morgs_mi.core.rig import with_near_planes
+from morgs_mi.io.clip_readers import FrameReader, open_clips
+from morgs_mi.io.images import ImageOrError
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.io.video import FrameReader, ImageOrError, open_clips
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.

@@ -11,9 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.io.clip_readers import FrameReader
 from morgs_mi.io.exr import opaque_light
+from morgs_mi.io.images import FolderReader, decode_image
 from morgs_mi.io.listing import existing_file
-from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
 
 def used_in_clip(

@@ -28,7 +28,7 @@ from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.checks import check_number, composed, few
 from morgs_mi.core.config import config_class
-from morgs_mi.io.video import FrameReader
+from morgs_mi.io.clip_readers import FrameReader
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0

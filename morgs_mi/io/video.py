@@ -1,7 +1,4 @@
-"""Readers of video files and of folders of images.
-
-A frame is an RGB array [H, W, 3]: uint8 in sRGB, or of an EXR file float32 in linear light.
-`VideoReader` and `FolderReader` have the same members.
+"""Reader of video files, with the members of `FolderReader`.
 
 Many cameras, above all in phones, record at a variable frame rate: they delay or leave out frames.
 The container stores the time of each frame, so the reader knows where on a regular clock the frames
@@ -10,32 +7,21 @@ lie.
 
 from __future__ import annotations
 
-import logging
-import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from sys import maxsize
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import cv2
-import imagesize
 import numpy as np
 
-from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.checks import errors_at
-from morgs_mi.core.png import has_whole_chunks
-from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import clock, time_code_seconds, true_rate
-from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
-from morgs_mi.io.numbering import (
-    check_counting,
-    check_numbering,
-    frame_numbers,
-    natural_key,
-)
+from morgs_mi.io.images import WHITE, Frames, ImageOrError, eight_bits
+from morgs_mi.io.listing import existing_file
 
 if TYPE_CHECKING:
     import av  # imported where a video is opened, as it takes 80 ms
@@ -43,10 +29,6 @@ if TYPE_CHECKING:
     from av.video.reformatter import VideoReformatter
 
 _Item = TypeVar("_Item")
-# Bytes of memory that a pixel takes, in BGR and RGB.
-_BYTES_PER_PIXEL = 6
-WHITE = 2**16 - 1
-"""White of images of 16 bits, unless a capture sets another one."""
 # FFmpeg's readers of videos. None of them opens the files that a text names, as that of play lists
 # does.
 _CONTAINERS = {
@@ -56,9 +38,6 @@ _CONTAINERS = {
 # Colours that are not converted, by their codes in ITU-T H.273.
 _TRANSFERS = {16: "PQ", 18: "HLG"}
 _PRIMARIES = {9: "BT.2020", 12: "Display P3"}
-# What a file is expected to be, and the remedy if there is none.
-_IMAGE = ("an image", "extract the frames again, or go on without it (--gaps)")
-_LOG = logging.getLogger(__name__)
 # First frame that is worth a search, and the frames before it at which the search aims: those shown
 # right after a keyframe may refer to frames before it, and a file may be indexed by the times of
 # decoding.
@@ -68,29 +47,8 @@ _BEFORE = 32
 _MAX_PAUSE = 1_000_000
 
 
-class _Frames:
-    """The members that the readers share."""
-
-    num_frames: int
-
-    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
-        raise NotImplementedError
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
-        """Yield frames start..stop-1, by default up to `num_frames`.
-
-        Raises:
-            ValueError: a frame cannot be decoded or has another size than the first.
-            FileNotFoundError: an image is missing.
-        """
-        for image in self.pick(range(self.num_frames)[start:stop]):
-            if isinstance(image, Exception):
-                raise image
-            yield image
-
-
 @dataclass(frozen=True)
-class VideoReader(_Frames):
+class VideoReader(Frames):
     """Reader of a video file.
 
     Each call of `frames` or `pick` decodes from the start, or far from there from a keyframe.
@@ -245,7 +203,7 @@ class VideoReader(_Frames):
             interpolation="BICUBIC",
             threads=1,
         ).to_ndarray()
-        image = cv2.cvtColor(_shown(_eight_bits(bgr, self.white), frame), cv2.COLOR_BGR2RGB)
+        image = cv2.cvtColor(_shown(eight_bits(bgr, self.white), frame), cv2.COLOR_BGR2RGB)
         if image.shape[:2] != (self.height, self.width):
             raise ValueError(
                 f"expected {self.width}x{self.height}, got {image.shape[1]}x{image.shape[0]}; "
@@ -375,276 +333,9 @@ def _shown(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
     return image[:: int(b + d), :: int(a + c)]
 
 
-def _eight_bits(image: np.ndarray, white: int) -> np.ndarray:
-    """Return an image of 16 bits with 8 bits, any other one as it is.
-
-    Raises:
-        ValueError: a value is above white.
-    """
-    if image.dtype != np.uint16:
-        return image
-    if image.max() > white:
-        raise ValueError(
-            f"expected values up to the `white` of capture.json, {white}, got {image.max()}; "
-            "correct it"
-        )
-    return cv2.convertScaleAbs(image, alpha=255 / white)
-
-
 def _unreadable(path: Path, reason: str) -> ValueError:
     return ValueError(
         f"{path}: expected a video, got {path.stat().st_size} bytes that FFmpeg cannot read "
         f"({reason}): the file is truncated, no video, or in a rare codec; copy it again, or "
         "convert it to H.264."
     )
-
-
-@dataclass(frozen=True)
-class FolderReader(_Frames):
-    """Reader of a folder of numbered images, e.g. ``0000.png``, with the members of `VideoReader`,
-    `fps` and `positions` being None.
-
-    The images may also be a list of files in any folders; `path` is then the folder of the first.
-    """
-
-    path: Path
-    files: tuple[Path, ...]
-    width: int
-    height: int
-    fps: float | None = None
-    positions: np.ndarray | None = None
-    #: Numbers of the images, None of a list of files.
-    numbers: range | None = None
-    #: Largest value of the first image if it has 16 bits, otherwise None.
-    most: int | None = None
-    white: int = WHITE  #: Value of white in images of 16 bits.
-    start: ClassVar[float] = np.nan
-    notes: tuple[str, ...] = ()  #: A sentence for each property of the files that is not used.
-
-    @classmethod
-    def open(cls, path: str | Path) -> FolderReader:
-        """Return the reader of a folder's images in the order of their numbers; the first is
-        decoded.
-
-        Raises:
-            FileNotFoundError: the folder or the images are missing.
-            ValueError: a number is missing or occurs twice, or the first image cannot be decoded.
-        """
-        path = Path(path)
-        images = _images(path)
-        files = list(images.values())
-        numbers = list(images)
-        check_numbering(path, numbers, [file.name for file in files])
-        step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
-        return replace(cls.of_files(files), numbers=range(numbers[0], numbers[-1] + step, step))
-
-    @classmethod
-    def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
-        """Return the reader of the images `files`; the first is decoded, with `gaps` the first that
-        is readable.
-
-        Raises:
-            FileNotFoundError: a file is missing.
-            ValueError: the first cannot be decoded.
-        """
-        for file in () if gaps else files:
-            existing_file(file, *_IMAGE)
-        readable = (f for f in files if not (gaps and isinstance(_image_or_error(f), Exception)))
-        file = next(readable, files[0])
-        first = _read_image(file)
-        height, width = first.shape[:2]
-        most = int(first.max()) if first.dtype == np.uint16 else None
-        notes = []
-        if (pages := cv2.imcount(str(file))) > 1:
-            notes = [f"images have {pages} pages, of which the first is used; extract all."]
-        return cls(files[0].parent, tuple(files), width, height, most=most, notes=tuple(notes))
-
-    @property
-    def num_frames(self) -> int:
-        """Number of images."""
-        return len(self.files)
-
-    num_held = num_frames
-
-    @property
-    def has_light(self) -> bool:
-        """Whether the images are EXR files, which have linear light."""
-        return self.files[0].suffix.lower() == EXR_SUFFIX
-
-    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
-        """Yield the frames `indices`, with an error in place of each that is missing, broken or of
-        another size.
-        """
-        for index in indices:
-            if index >= self.num_frames:
-                yield ValueError(
-                    f"{self.path}: it has ended after {self.num_frames} images; record longer."
-                )
-                continue
-            file = self.files[index]
-            frame = _image_or_error(file)
-            if isinstance(frame, Exception):
-                yield frame
-            elif frame.shape[:2] != (self.height, self.width):
-                yield ValueError(
-                    f"{file}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
-                    f"{frame.shape[1]}x{frame.shape[0]}; extract the frames again."
-                )
-            else:
-                try:
-                    yield _eight_bits(frame, self.white)
-                except ValueError as error:
-                    yield ValueError(f"{file}: {error}.")
-
-
-FrameReader = VideoReader | FolderReader
-Clip = Path | tuple[Path, ...]
-"""A video file, a folder of images, or a list of image files."""
-ImageOrError = np.ndarray | ValueError | FileNotFoundError
-"""A frame, or the reason why it is missing."""
-
-
-def open_clips(
-    clips: Sequence[Clip], gaps: bool = False, white: int | None = None
-) -> list[FrameReader]:
-    """Return one reader per camera; with `gaps`, images may be missing or broken.
-
-    Folders are then aligned by the numbers of their images: a number that only others have is a
-    missing image.
-
-    Without `white`, a warning names images of 16 bits that are nearly black, because cameras of 10
-    or 12 bits may have written them.
-
-    Args:
-        clips: one per camera.
-        gaps: whether images may be missing.
-        white: value of white in images of 16 bits; None: the largest.
-
-    Raises:
-        FileNotFoundError: a clip is missing, or one of its images.
-        ValueError: as `VideoReader.open` and `FolderReader.open`.
-    """
-    folders = _aligned_folders(
-        [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
-    )
-    readers = [folders[clip] if clip in folders else open_frames(clip, gaps) for clip in clips]
-    largest = max(
-        (reader.most or 0 for reader in readers if reader.most is not None), default=WHITE
-    )
-    if white is None and largest < WHITE // 4:
-        _LOG.warning(
-            "%s and the other cameras: the first images have 16 bits but no value above %d and are "
-            "nearly black; if white is less than %d, such as 4095 of cameras with 12 bits, set "
-            '"white": 4095 in capture.json.',
-            readers[0].path,
-            largest,
-            WHITE,
-        )
-    return [replace(reader, white=white or WHITE) for reader in readers]
-
-
-def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
-    """Return the readers of folders of images, aligned by the numbers of their images.
-
-    Raises:
-        ValueError: the numbers of a folder do not count, those of two do not overlap, or there are
-            far more timestamps than images.
-    """
-    if not folders:
-        return {}
-    files_by_number = {folder: _images(folder) for folder in folders}
-    for folder, files in files_by_number.items():
-        check_counting(folder, [*files], [file.name for file in files.values()])
-    first = max(map(min, files_by_number.values()))
-    last = min(map(max, files_by_number.values()))
-    if first > last:
-        raise ValueError(
-            f"{folders[0].parent}: expected cameras with numbers of images that overlap, got one "
-            f"that ends with {last} and one that begins with {first}; pair their images by "
-            "position with --offset in place of --gaps, or leave one out with --exclude."
-        )
-    numbers = sorted(set().union(*files_by_number.values()))
-    steps = np.diff(numbers)
-    step = math.gcd(*steps.tolist()) or 1
-    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-        gap = int(np.argmax(steps))
-        clips = files_by_number.values()
-        file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
-        raise ValueError(
-            f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
-            "remove or renumber it."
-        )
-    timestamps = range(numbers[0], numbers[-1] + 1, step)
-    readers: dict[Clip, FrameReader] = {}
-    for folder, files in files_by_number.items():
-        suffix = next(iter(files.values())).suffix
-        images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
-        readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
-    return readers
-
-
-def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:
-    """Return the reader of a video file, a folder of images or a list of images; raises the errors
-    of their `open`.
-
-    With `gaps`, images of a list may be missing or broken.
-    """
-    if isinstance(path, tuple):
-        return FolderReader.of_files(path, gaps)
-    return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
-
-
-def _images(path: Path) -> dict[int, Path]:
-    """Return a folder's images by their numbers, in natural order."""
-    images = by_stem(images_in(path) if path.is_dir() else [])
-    names = sorted(images, key=natural_key)
-    if not names:
-        suffixes = ", ".join((*IMAGE_SUFFIXES, EXR_SUFFIX))
-        raise FileNotFoundError(f"{path}: expected images ({suffixes}), found none; extract them.")
-    return dict(zip(frame_numbers(path, names), (images[name] for name in names), strict=True))
-
-
-def _image_or_error(file: Path) -> ImageOrError:
-    try:
-        return _read_image(file)
-    except (ValueError, FileNotFoundError) as error:
-        return error
-
-
-def _read_image(file: Path) -> np.ndarray:
-    existing_file(file, *_IMAGE)
-    if file.suffix.lower() == EXR_SUFFIX:
-        try:
-            return read_light(file)
-        except OSError as error:
-            raise ValueError(str(error)) from None
-    # The stored pixels, without EXIF's rotation: calibrations refer to them.
-    image = decode_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    if image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{file}: expected 8 or 16 bits, got {image.dtype}; convert it.")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def decode_image(file: Path, mode: int) -> np.ndarray:
-    """Return the image in a file, decoded by OpenCV with `mode`.
-
-    Args:
-        file: the file.
-        mode: of `cv2.imdecode`.
-
-    Raises:
-        ValueError: it is no image, is a truncated PNG, or claims more pixels than the file may
-            hold.
-    """
-    data = np.fromfile(file, np.uint8)
-    width, height = imagesize.get(file)  # -1 where the header does not show it
-    check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
-    is_png = data[:4].tobytes() == b"\x89PNG"
-    is_whole = has_whole_chunks(data.tobytes()) if is_png else len(data) > 0
-    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if is_whole else None
-    if image is None:
-        raise ValueError(
-            f"{file}: expected an image, got {len(data)} bytes that are none, or a part of one; "
-            "copy it again."
-        )
-    return image

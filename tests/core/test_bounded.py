@@ -14,9 +14,9 @@ from numpy.testing import assert_array_equal
 
 from morgs_mi.core.bounded import MAX_JSON, MAX_TOML, array_names, read_array, read_json, read_toml
 from morgs_mi.io.exr import read_exr, write_exr
+from morgs_mi.io.images import FolderReader
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.splats import read_splats
-from morgs_mi.io.video import FolderReader
 
 
 @pytest.fixture(autouse=True)

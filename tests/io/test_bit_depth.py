@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.io.video import open_clips
+from morgs_mi.io.clip_readers import open_clips
 from tests.scenes.captures import write_timed_video
 
 

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.masks import opaque_pixels
-from morgs_mi.io.video import FolderReader
+from morgs_mi.io.images import FolderReader
 
 RGB = np.random.default_rng(0).integers(0, 256, (37, 53, 3)).astype(np.uint8)
 RGBA = np.dstack(

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from morgs_mi.io.video import FAR, FolderReader, VideoReader, open_frames
+from morgs_mi.io.clip_readers import open_frames
+from morgs_mi.io.images import FolderReader
+from morgs_mi.io.video import FAR, VideoReader
 from morgs_mi.io.video_writer import FFV1, H264, VP9, write_video
 from tests.scenes.captures import write_timed_video
 from tests.scenes.full_disk import files_end_at

@@ -27,9 +27,9 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import few, require
 from morgs_mi.core.rig import far_origin, moved, scene_extent
+from morgs_mi.io.clip_readers import Clip
 from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
 from morgs_mi.io.numbering import frame_numbers, natural_key
-from morgs_mi.io.video import Clip
 
 _LOG = logging.getLogger(__name__)
 

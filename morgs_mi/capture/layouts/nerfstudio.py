@@ -33,9 +33,9 @@ from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.camera import Camera, intrinsic_matrix, rigid
 from morgs_mi.core.checks import check_number, errors_at, few, numbers, require
+from morgs_mi.io.clip_readers import Clip
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply import read_vertices
-from morgs_mi.io.video import Clip
 
 _LOG = logging.getLogger(__name__)
 

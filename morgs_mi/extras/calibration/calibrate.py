@@ -45,7 +45,7 @@ from morgs_mi.core.progress import Report
 from morgs_mi.core.types import Arrays
 from morgs_mi.extras.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck
-from morgs_mi.io.video import open_clips
+from morgs_mi.io.clip_readers import open_clips
 
 Mapper = Literal["incremental", "global"]
 

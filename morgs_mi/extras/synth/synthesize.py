@@ -41,8 +41,8 @@ from morgs_mi.extras.synth.ground_truth import (
 from morgs_mi.extras.synth.path_tracer import PathTracer, developed
 from morgs_mi.extras.synth.scene import Scene, check_scene, load_scene
 from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.io.listing import is_added
-from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import H264, write_video
 
 _LOG = logging.getLogger(__name__)

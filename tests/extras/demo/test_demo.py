@@ -11,7 +11,7 @@ from morgs_mi.core.bounded import read_json
 from morgs_mi.core.files import locked_folder
 from morgs_mi.extras.demo.demo import DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.extras.synth.synth_config import SynthConfig
-from morgs_mi.io.video import open_frames
+from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.playback.streams import open_stream
 from tests.quick import quick

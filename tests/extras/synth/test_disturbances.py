@@ -23,7 +23,7 @@ from morgs_mi.extras.synth.scene import Light, Object, Rig, Scene, load_scene, t
 from morgs_mi.extras.synth.shapes import box
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
-from morgs_mi.io.video import open_frames
+from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.testing import assert_close
 from tests.extras.synth.frames import FPS
 

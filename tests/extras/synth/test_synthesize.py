@@ -18,7 +18,7 @@ from morgs_mi.extras.synth.scene import Light, Object, Scene, load_scene
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.extras.synth.textures import lights, textured
-from morgs_mi.io.video import open_frames
+from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.testing import assert_close
 
 TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)

@@ -12,8 +12,8 @@ from numpy.testing import assert_array_equal
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light
+from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.io.ply import read_ply
-from morgs_mi.io.video import open_frames
 from morgs_mi.playback.export.clips import (
     _frames_backwards,
     named_path,

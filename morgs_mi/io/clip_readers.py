@@ -1,0 +1,67 @@
+"""Readers of the clips of cameras: video files, folders of images, and lists of images."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from morgs_mi.io.images import WHITE, FolderReader, aligned_folders
+from morgs_mi.io.video import VideoReader
+
+_LOG = logging.getLogger(__name__)
+
+FrameReader = VideoReader | FolderReader
+Clip = Path | tuple[Path, ...]
+"""A video file, a folder of images, or a list of image files."""
+
+
+def open_clips(
+    clips: Sequence[Clip], gaps: bool = False, white: int | None = None
+) -> list[FrameReader]:
+    """Return one reader per camera; with `gaps`, images may be missing or broken.
+
+    Folders are then aligned by the numbers of their images: a number that only others have is a
+    missing image.
+
+    Without `white`, a warning names images of 16 bits that are nearly black, because cameras of 10
+    or 12 bits may have written them.
+
+    Args:
+        clips: one per camera.
+        gaps: whether images may be missing.
+        white: value of white in images of 16 bits; None: the largest.
+
+    Raises:
+        FileNotFoundError: a clip is missing, or one of its images.
+        ValueError: as `VideoReader.open` and `FolderReader.open`.
+    """
+    folders = aligned_folders(
+        [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
+    )
+    readers = [folders[clip] if clip in folders else open_frames(clip, gaps) for clip in clips]
+    largest = max(
+        (reader.most or 0 for reader in readers if reader.most is not None), default=WHITE
+    )
+    if white is None and largest < WHITE // 4:
+        _LOG.warning(
+            "%s and the other cameras: the first images have 16 bits but no value above %d and are "
+            "nearly black; if white is less than %d, such as 4095 of cameras with 12 bits, set "
+            '"white": 4095 in capture.json.',
+            readers[0].path,
+            largest,
+            WHITE,
+        )
+    return [replace(reader, white=white or WHITE) for reader in readers]
+
+
+def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:
+    """Return the reader of a video file, a folder of images or a list of images; raises the errors
+    of their `open`.
+
+    With `gaps`, images of a list may be missing or broken.
+    """
+    if isinstance(path, tuple):
+        return FolderReader.of_files(path, gaps)
+    return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
