@@ -34,12 +34,12 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.points import MAX_ERROR
-from morgs_mi.capture.timeline import nearest_frames
+from morgs_mi.capture.timeline import nearest_frames, read_settings
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import few, require, valid_pixels
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.config import check_ranges, config_or_default
-from morgs_mi.core.files import atomic_path
+from morgs_mi.core.files import CAPTURE, atomic_path
 from morgs_mi.core.png import png_bytes
 from morgs_mi.core.progress import Report
 from morgs_mi.core.types import Arrays
@@ -313,7 +313,9 @@ def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tupl
             f"{path}: expected the clips of at least two cameras, found "
             f"{', '.join(names) or 'none'}; check the path, or make {EXAMPLE}"
         )
-    readers = dict(zip(names, open_clips([clips[name] for name in names]), strict=True))
+    white = read_settings(path / CAPTURE).get("white")
+    readers = open_clips([clips[name] for name in names], white=white)
+    readers = dict(zip(names, readers, strict=True))
     # The last timestamp of each clip, in frames of a constant rate.
     last_frames = {
         name: reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])

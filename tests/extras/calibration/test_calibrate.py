@@ -256,6 +256,17 @@ def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path):
         calibrate(tmp_path)
 
 
+def test_frames__take_white_from_the_settings(tmp_path):
+    """Images of 16 bits by cameras of 12."""
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        image = np.full((32, 48, 3), 4095, np.uint16)
+        cv2.imwrite(str(tmp_path / name / "0000.png"), image)
+    (tmp_path / "capture.json").write_text('{"white": 4095}')
+    images, _ = _frames(tmp_path, CalibrateConfig(), ())
+    assert {name: image.max() for name, image in images.items()} == {"a": 255, "b": 255}
+
+
 def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path):
     for name, times in (("a", [0, 50, 100, 150, 200, 250, 300]), ("b", [0, 50, 100, 250, 300])):
         write_timed_video(
