@@ -24,7 +24,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import quantity
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.memory import process_memory, release_memory
+from morgs_mi.core.memory import FrameBuffers
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
@@ -53,12 +53,6 @@ from morgs_mi.method.objective import channels_of, observe
 from morgs_mi.method.ssim import Target
 
 _LOG = logging.getLogger(__name__)
-# Growth of the resident memory after which releasing it pays: the next frame allocates its buffers
-# again.
-_GROWTH = 1.1
-# Fraction of the most active pixels since memory was released, below which it is released again: at
-# most once each time that the changes halve.
-_SHRINKAGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,11 +229,7 @@ class StreamLoop:
         self.state = StreamState()
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
-        self._resident = 0  # bytes, before memory was last released
-        # Fractions of the pixels that were active in the last frame, and the most of all frames
-        # since memory was last released.
-        self._last_pixels = 0.0
-        self._most_pixels = 0.0
+        self._buffers = FrameBuffers()
         # Whether images in a list may be in another order than the cameras.
         self._can_mistake_order = True
 
@@ -313,20 +303,7 @@ class StreamLoop:
             self._next_observation = frame + 1, in_background(observe_next)
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
-        memory = process_memory()
-        pixels = report.active.get("pixels", 0.0)
-        recent_pixels = max(pixels, self._last_pixels)  # videos repeat single frames
-        self._last_pixels = pixels
-        self._most_pixels = max(pixels, self._most_pixels)
-        # Buffers for more active Gaussians have a new size, and the smaller ones stay allocated.
-        # The buffers of the first frame, and of frames that changed much more, are not used again.
-        resident = memory.get("resident", 0)
-        has_grown = resident > _GROWTH * self._resident
-        if has_grown or recent_pixels < _SHRINKAGE * self._most_pixels:
-            self._resident = max(resident, self._resident) if frame else 0
-            self._most_pixels = recent_pixels
-            release_memory()
-            memory = process_memory()
+        memory = self._buffers.end_frame(frame, report.active.get("pixels", 0.0))
         return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)
 
     def _observation_ahead(self, images: Frame) -> FrameObservation | None:

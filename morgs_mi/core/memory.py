@@ -25,6 +25,12 @@ except ImportError:  # Windows
 
 # Bytes: Dr.Jit aligns its own memory to as many.
 _ALIGNMENT = 64
+# Growth of the resident memory after which releasing it pays: the next frame allocates its buffers
+# again.
+_GROWTH = 1.1
+# Fraction of the most active pixels since memory was released, below which it is released again: at
+# most once each time that the changes halve.
+_SHRINKAGE = 0.5
 
 
 def from_numpy(kind: type[Jit], values: ArrayLike) -> Jit:
@@ -161,6 +167,41 @@ def release_memory() -> None:
     dr.flush_malloc_cache()
     with suppress(AttributeError):  # another C library
         ctypes.pythonapi.malloc_trim(0)  # a handle that exists: a new one is a cycle of objects
+
+
+class FrameBuffers:
+    """Memory that Dr.Jit and glibc keep from frame to frame, for buffers of the same sizes.
+
+    Buffers for more active Gaussians have a new size, and the smaller ones stay allocated. The
+    buffers of the first frame, and of frames that changed much more, are not used again.
+    """
+
+    def __init__(self) -> None:
+        self._resident = 0  # bytes, before memory was last released
+        # Fractions of the pixels that were active in the last frame, and the most of all frames
+        # since memory was last released.
+        self._last_pixels = 0.0
+        self._most_pixels = 0.0
+
+    def end_frame(self, frame: int, pixels: float) -> dict[str, int]:
+        """Release what the next frame will not use, and return the `process_memory`.
+
+        Args:
+            frame: the frame that ends.
+            pixels: fraction of its pixels that were active.
+        """
+        recent_pixels = max(pixels, self._last_pixels)  # videos repeat single frames
+        self._last_pixels = pixels
+        self._most_pixels = max(pixels, self._most_pixels)
+        memory = process_memory()
+        resident = memory.get("resident", 0)
+        has_grown = resident > _GROWTH * self._resident
+        if not has_grown and recent_pixels >= _SHRINKAGE * self._most_pixels:
+            return memory
+        self._resident = max(resident, self._resident) if frame else 0
+        self._most_pixels = recent_pixels
+        release_memory()
+        return process_memory()
 
 
 def _lines(path: str) -> list[str]:
