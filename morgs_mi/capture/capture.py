@@ -142,8 +142,8 @@ class Capture:
         return tuple(i for i in range(len(self.cameras)) if i not in self.test_views)
 
     @property
-    def place(self) -> str:
-        """Path of the first camera's clip in the capture."""
+    def first_clip(self) -> str:
+        """Path of the first camera's video or folder of images, relative to the capture."""
         return os.path.relpath(self._sources[0].reader.path, self.path)
 
     @property

@@ -115,7 +115,7 @@ class Info:
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(
             f"{quantity(capture.num_frames, 'frame')} at {capture.fps:g} fps "
-            f"({capture.names[0]}: {capture.place}), {points}, {truth}."
+            f"({capture.names[0]}: {capture.first_clip}), {points}, {truth}."
         )
         for note in capture.notes:
             print_result(note)
