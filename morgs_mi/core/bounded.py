@@ -40,6 +40,8 @@ _JSON_BYTES = {"{": 200, "[": 60, ",": 40}
 _LONG_KEY = re.compile(
     r"""(?<![\w\\-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){21}"""
 )
+# Digits of a number that is not decimal, which Python does not print.
+_LONG_NUMBER = re.compile(r"0[xob][\da-fA-F_]{1000}")
 
 
 def most_memory(size: int) -> int:
@@ -140,11 +142,13 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: the file is broken, too large or nested too deeply, or a key has many dots.
+        ValueError: the file is broken, too large or nested too deeply, or a key or number is too long.
     """
     text = read_text(path, MAX_TOML)
     has_long_key = _LONG_KEY.search(text) is not None
     require(not has_long_key, path, "expected keys of at most 20 dots", "more", "nest fewer tables")
+    has_long_number = _LONG_NUMBER.search(text) is not None
+    require(not has_long_number, path, "expected numbers below 1000 digits", "more", "correct it")
     with _refusing(path, "TOML", "write it again"):
         return tomllib.loads(text)
 

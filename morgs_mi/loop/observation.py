@@ -101,6 +101,7 @@ def prepare(
         check_type("StreamLoop()", "cameras", camera, Camera, OF_SENSOR)
     points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     masks = (None,) * len(cameras) if masks is None else masks
+    check_type("StreamLoop()", "masks", masks, Sequence, "pass a list")
     if len(masks) != len(cameras):
         raise ValueError(
             f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "

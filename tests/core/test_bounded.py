@@ -127,6 +127,7 @@ CASES = {
         "expected content that fits its 16000003 bytes, got a claim of many small objects and list",
     ),
     "TOML of a long key": (read_toml, b"a" + b".a" * 20_000 + b"=1", "keys of at most 20 dots"),
+    "TOML of a long number": (read_toml, b"a = 0x" + b"f" * 6000, "numbers below 1000 digits"),
     "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
     "TOML of open strings": (
         read_toml,
