@@ -142,7 +142,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: the file is broken, too large or nested too deeply, or a key or number is too long.
+        ValueError: the file is broken, too large or nested too deeply, or a key or a number is too
+            long.
     """
     text = read_text(path, MAX_TOML)
     has_long_key = _LONG_KEY.search(text) is not None
