@@ -43,11 +43,12 @@ wheel: setup
 # LLVM is checked every time: it is outside the environment, and finding it takes 50 ms.
 setup: $(STAMP)
 	@tools/setup_llvm.sh $(BIN)/python
+	@$(if $(filter setup,$(MAKECMDGOALS)),echo "Ready: make demo",:)
 
 $(STAMP): pyproject.toml constraints.txt tools/setup_venv.sh
-	tools/setup_venv.sh $(PYTHON) $(VENV)
+	@tools/setup_venv.sh $(PYTHON) $(VENV)
 	@touch $@
 
 clean:
-	rm -rf $(VENV) out build dist web/node_modules *.egg-info .pytest_cache .ruff_cache docs/_build docs/notebooks docs/api/morgs_mi*.md
+	rm -rf $(VENV) out build dist web/node_modules *.egg-info .pytest_cache .ruff_cache docs/_build docs/notebooks docs/api/*_*.md
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,7 +2,7 @@
 each set_variant().
 
 It is light: the package is imported when the first integrator is made. LLVM must be found by
-Mitsuba itself, because `morgs_mi.core.llvm` is too late then.
+Mitsuba itself, because `morgs_mi.platform.llvm` is too late then.
 """
 
 from functools import partial

@@ -27,8 +27,8 @@ for terms in ((), ("speed:10",)):
     fit = morgs_mi.FitConfig(num_gaussians=2000, first_frame_steps=200, objective=objective)
     loop = morgs_mi.StreamLoop.of(capture, morgs_mi.StreamConfig(fit=fit))
     for frame in capture.frames():
-        _, report = loop.push([frame.images[v] for v in capture.train_views])
+        _, report = loop.push(frame.train)
     print(terms, report.losses, abs(np.array(loop.gaussians.motion)).mean())
-    image = morgs_mi.rasterize(loop.gaussians, capture.cameras[capture.test_views[0]], ("motion",))
-    pictures.append(morgs_mi.motion_image(image.motion, 2))
+    image = morgs_mi.rasterize(loop.gaussians, capture.views.test[0].camera, ("color", "motion"))
+    pictures.append(morgs_mi.motion_image(image.motion, 2, image.color))
 mi.util.write_bitmap(output, np.concatenate(pictures, axis=1))  # motion without and with the term

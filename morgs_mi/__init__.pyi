@@ -6,8 +6,8 @@ from .codec.codec_config import CodecConfig
 from .core.camera import Camera
 from .core.color_space import SH_C0
 from .core.gaussians import Gaussians
-from .core.progress import ProgressBar
 from .core.rig import with_near_planes
+from .core.view import View
 from .evaluate.accuracy import accuracy
 from .evaluate.evaluate import evaluate_stream
 from .extras.light.insert import shadow_ratio, shadowed
@@ -28,11 +28,13 @@ from .loop.frame_report import FrameReport
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
 from .method.objective import ObjectiveConfig, loss_term
+from .platform.progress import ProgressBar
 from .playback.player import channel_image, render_stream
 from .playback.streams import open_stream
 from .playback.visualise import confidence_image, depth_image, motion_image
+from .render.active_view import ActiveView
 from .render.kernel_recording import render_lock
-from .render.rasterize import Image, rasterize
+from .render.rasterize import Image, rasterize, render_view
 from .render.render_config import RenderConfig
 from .runs.fit_capture import stream_capture
 from .stream_loop import StreamLoop
@@ -40,6 +42,7 @@ from .surfaces.splat_rays import SplatRays
 
 __all__ = [
     "SH_C0",
+    "ActiveView",
     "Camera",
     "Capture",
     "CodecConfig",
@@ -59,6 +62,7 @@ __all__ = [
     "SweepResult",
     "SynthConfig",
     "Vary",
+    "View",
     "accuracy",
     "channel_image",
     "confidence_image",
@@ -80,6 +84,7 @@ __all__ = [
     "read_splats",
     "render_lock",
     "render_stream",
+    "render_view",
     "shadow_ratio",
     "shadowed",
     "stream_capture",

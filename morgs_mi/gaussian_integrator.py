@@ -31,27 +31,28 @@ from __future__ import annotations
 
 import sys
 from functools import partial
-from pkgutil import resolve_name
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import from_numpy, owned_copy
 from morgs_mi.core.attributes import shape_attribute_widths
-from morgs_mi.core.checks import require
-from morgs_mi.core.extras import places
 from morgs_mi.core.gaussians import ActivatedGaussians, require_some
-from morgs_mi.core.memory import from_numpy, owned_copy
+from morgs_mi.core.types import SceneDict
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.extras import enter, extra, places
 
-# The class of each plugin, MODULE:NAME.
-_PLUGINS = {
-    "gaussian_splat": "morgs_mi.surfaces.gaussian_splat:GaussianSplatIntegrator",
-    **places("integrators"),
-}
+# The class of a plugin, as extras enter theirs.
+enter(
+    "morgs_mi.surfaces",
+    "integrators",
+    {"gaussian_splat": "gaussian_splat:GaussianSplatIntegrator"},
+)
 
 
-def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
+def ellipsoids(gaussians: ActivatedGaussians) -> SceneDict:
     """Return the dictionary of an `ellipsoids` shape with a copy of N Gaussians' activated
     attributes.
 
@@ -119,9 +120,12 @@ def integrator(plugin: str, props: Any) -> Any:
     """Return an integrator of the active variant; `plugin` is its type, `props` are its properties.
 
     In a variant without derivatives, such as `scalar_rgb`, it refuses to render.
+
+    Raises:
+        ValueError: the plugin is an extra's that is not there.
     """
     if dr.is_diff_v(mi.Float):
-        return resolve_name(_PLUGINS[plugin])(props)
+        return extra("integrators", plugin)(props)
     variant = mi.variant()
 
     # Mitsuba would report an error of a constructor as a traceback inside another one.
@@ -143,7 +147,7 @@ def integrator(plugin: str, props: Any) -> Any:
 
 def _register(*_arguments: Any) -> None:
     """Register the plugins with the active variant."""
-    for plugin, place in _PLUGINS.items():
+    for plugin, place in places("integrators").items():
         # Its class is defined again, with the base class of this variant, when it is next used.
         sys.modules.pop(place.partition(":")[0], None)
         mi.register_integrator(plugin, partial(integrator, plugin))

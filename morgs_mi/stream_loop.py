@@ -21,13 +21,9 @@ import numpy as np
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import quantity
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.memory import FrameBuffers
-from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.core.threads import in_background
+from morgs_mi.core.view import View
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.loop.first_frame import (
     corrected,
@@ -36,13 +32,14 @@ from morgs_mi.loop.first_frame import (
     with_first_confidence,
 )
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.input_images import Frame, as_array, image_status, in_order
+from morgs_mi.loop.input_images import FrameImages, as_array, image_status, in_order
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
     Setup,
     extended_history,
     observe_frame,
+    over_border,
     prepare,
 )
 from morgs_mi.loop.stream_config import StreamConfig
@@ -50,7 +47,13 @@ from morgs_mi.method.active_set import find_active_set
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import channels_of, observe
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.ssim import Target
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.interrupts import interrupts_raised
+from morgs_mi.platform.memory import FrameBuffers
+from morgs_mi.platform.progress import Progress, Report
+from morgs_mi.platform.threads import in_background
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,7 +84,7 @@ class StreamState:
 def step(
     setup: Setup,
     state: StreamState,
-    images: Frame | FrameObservation,
+    images: FrameImages | FrameObservation,
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
@@ -93,7 +96,8 @@ def step(
         state: as returned for the last frame; `StreamState()` before the first.
         images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in
             sRGB, linear light as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag
-            `srgb_gamma` counts. They are copied. A dict has them by the cameras' names.
+            `srgb_gamma` counts. They are copied. A dict has them by the cameras' names, and so have
+            views with images, such as ``frame.train`` of a frame of a capture.
             Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a
             later one.
@@ -116,7 +120,7 @@ def step(
         packet, fitted = _fit_later_frame(setup, state, observation, frame_progress)
     coded = decode(state.coded, packet)
     present = observation.history.images
-    problems = image_status([c.name for c in setup.cameras], state.history.images, present)
+    problems = image_status([v.name for v in setup.views], state.history.images, present)
     if state.coded is None:
         for problem in problems:
             _LOG.warning("frame 0: %s", problem)
@@ -125,9 +129,7 @@ def step(
         fitted,
         seconds=time.perf_counter() - start_time,
         status="; ".join(filter(None, [*problems, fitted.status])) or "ok",
-        missing_views=tuple(
-            camera.name for v, camera in enumerate(setup.cameras) if v not in present
-        ),
+        missing_views=tuple(view.name for v, view in enumerate(setup.views) if v not in present),
         exposures=tuple(
             later_exposures.get(v, Exposure()).after(first)
             for v, first in enumerate(fitted.exposures)
@@ -153,23 +155,30 @@ def _fit_later_frame(
         first_images = state.history.images
         previous = with_first_confidence(setup, previous, first_images, observation.flows, rng)
     objective = config.fit.objective
-    observations = observe(observation.key_views, motion, objective)
     active = find_active_set(
         previous,
-        {v: setup.cameras[v] for v in images},
+        {v: setup.views[v].camera for v in images},
         observation.changes,
-        {v: channels_of(observations.get(v, {}), objective) for v in images},
         config.render,
         motion.active_set,
     )
+    # The optical flow, which is computed beside that.
+    observations = observe(observation.key_views, motion, objective)
+    channels = dict.fromkeys(
+        channel
+        for observed in ({}, *observations.values())
+        for channel in channels_of(observed, objective)
+    )
+    active = active.with_static(previous, [*channels])
     recorded = {view: observation.encoded[view] for view in active.views}
-    targets = {
-        view: Target(image, setup.masks[view])
-        for view, image in corrected(recorded, state.exposures).items()
+    scene_images = corrected(recorded, state.exposures)
+    views = {
+        v: ObservedView.of(view, Target(scene_images[v], setup.views[v].mask), observations.get(v))
+        for v, view in active.views.items()
     }
     # The motion (eq. 5) starts from zero in the paper, and here from lifted flow and proposals.
-    start = initial_motion(previous, active, observation.flows, targets, motion, rng)
-    problem = FrameProblem(previous, active, targets, observations, start, setup.extent)
+    start = initial_motion(previous, active, views, observation.flows, motion, rng)
+    problem = FrameProblem(previous, active, views, start, setup.extent)
     # Residual (eqs. 6-8, 12) and objective (eq. 13).
     fitted = fit_later_frame(problem, config.fit, motion, rng, progress)
     # The next frame starts from what a decoder reads (eq. 3).
@@ -183,8 +192,8 @@ def _fit_later_frame(
         num_gaussians=len(fitted.gaussians),
         psnr=fitted.psnr,
         status=fitted.problem if images else "no view has an image",
-        active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
-        steps=fitted.epochs * len(active.views),
+        active=active.fractions,
+        steps=fitted.steps,
         exposures=state.exposures,
     )
     return packet, report
@@ -196,36 +205,35 @@ class StreamLoop:
     The packet of a frame is final when `push` returns; no later frame changes it.
 
     Args:
-        cameras: the training views.
+        views: the training views: `View`s, which may have a mask, or cameras.
         points: SfM points [P, 3], world units; fewer than 20, or points of which the cameras see
-            less than 5 %, are replaced by random ones inside the views.
+            less than 5 %, are replaced as by `fit_gaussians`, and the background is the colour that
+            the borders of the first images have in common, unless one is given.
         point_colors: [P, 3], encoded: 1 is white.
         config: settings.
-        masks: per view [H, W] bool of valid pixels, or None.
         display_exposure: exposure in stops at which images in linear light are converted to 8 bits
             for optical flow and the detection of changes; losses do not depend on it. None: 0 if no
             light of the first frame exceeds 1, otherwise the 99th percentile becomes white.
 
     Example:
-        >>> loop = morgs_mi.StreamLoop(cameras, points, point_colors)
-        >>> for images in frames:  # an image [H, W, 3] per camera: uint8, or linear light
+        >>> loop = morgs_mi.StreamLoop(views, points, point_colors)
+        >>> for images in frames:  # an image [H, W, 3] per view: uint8, or linear light
         ...     packet, report = loop.push(images)
 
     Raises:
-        ValueError: no cameras, points that are not finite, colours of another range or shape, or a
+        ValueError: no views, points that are not finite, colours of another range or shape, or a
             mask of another shape than its view.
     """
 
     def __init__(
         self,
-        cameras: Sequence[Camera],
+        views: Sequence[View | Camera],
         points: np.ndarray,
         point_colors: np.ndarray,
         config: StreamConfig | None = None,
-        masks: Sequence[np.ndarray | None] | None = None,
         display_exposure: float | None = None,
     ) -> None:
-        self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
+        self.setup = prepare(views, points, point_colors, config, display_exposure)
         self.state = StreamState()
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
@@ -238,24 +246,22 @@ class StreamLoop:
         """Return the loop of the training views of a capture.
 
         Args:
-            capture: a `Capture`, or another value with its cameras, train_views, masks, points,
-                point_colors and display_exposure.
+            capture: a `Capture`, or another value with its views, points, point_colors and
+                display_exposure.
             config: settings.
         """
-        views = capture.train_views
         loop = cls(
-            [capture.cameras[v] for v in views],
+            capture.views.train,
             capture.points,
             capture.point_colors,
             config,
-            [capture.masks[v] for v in views],
             capture.display_exposure,
         )
         loop._can_mistake_order = False
         return loop
 
     def __repr__(self) -> str:
-        cameras = quantity(len(self.setup.cameras), "camera")
+        cameras = quantity(len(self.setup.views), "camera")
         gaussians = "" if self.gaussians is None else f", {self.gaussians}"
         return f"StreamLoop({cameras}, frame {self.state.frame} is next{gaussians})"
 
@@ -267,10 +273,10 @@ class StreamLoop:
     @interrupts_raised()
     def push(
         self,
-        images: Frame,
+        images: FrameImages,
         progress: Report | None = None,
-        upcoming: Frame | None = None,
-        recorded: Frame | None = None,
+        upcoming: FrameImages | None = None,
+        recorded: FrameImages | None = None,
         on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
@@ -288,6 +294,8 @@ class StreamLoop:
         start_time = time.perf_counter()
         frame = self.state.frame
         previous = self.state.history
+        if not frame:
+            self.setup = over_border(self.setup, images)
         observation = self._observation_ahead(images)
         if observation is None:
             observation = observe_frame(self.setup, frame, previous, images)
@@ -297,7 +305,7 @@ class StreamLoop:
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:  # beside the fit, which starts below
-            ahead = in_order(self.setup.cameras, upcoming, frame + 1)
+            ahead = in_order(self.setup.views, upcoming, frame + 1)
             copies = [None if image is None else np.array(as_array(image)) for image in ahead]
             observe_next = partial(observe_frame, self.setup, frame + 1, history, copies)
             self._next_observation = frame + 1, in_background(observe_next)
@@ -306,7 +314,7 @@ class StreamLoop:
         memory = self._buffers.end_frame(frame, report.active.get("pixels", 0.0))
         return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)
 
-    def _observation_ahead(self, images: Frame) -> FrameObservation | None:
+    def _observation_ahead(self, images: FrameImages) -> FrameObservation | None:
         """Return the observation that was made ahead of time if its images are the same; it is used
         once.
         """
@@ -315,7 +323,7 @@ class StreamLoop:
         if task is None or task[0] != self.state.frame:
             return None
         observation = task[1].result()
-        ordered = enumerate(in_order(self.setup.cameras, images, self.state.frame))
+        ordered = enumerate(in_order(self.setup.views, images, self.state.frame))
         present = {v: as_array(image) for v, image in ordered if image is not None}
         same_images = present.keys() == observation.recorded.keys() and all(
             np.array_equal(image, observation.recorded[v]) for v, image in present.items()
@@ -325,7 +333,7 @@ class StreamLoop:
     def resume(
         self,
         coded: CodedFrame,
-        frames: Iterable[Frame],
+        frames: Iterable[FrameImages],
         exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.
@@ -339,6 +347,8 @@ class StreamLoop:
         """
         history = ImageHistory()
         for images in frames:
+            if not history.images:
+                self.setup = over_border(self.setup, images)
             history = extended_history(self.setup, coded.frame, history, images)
         self.state = StreamState(coded.frame + 1, coded, history, tuple(exposures))
         self._next_observation = None

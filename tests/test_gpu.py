@@ -7,10 +7,12 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi import Gaussians, StreamLoop, rasterize
-from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.objective import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
@@ -122,9 +124,9 @@ def test_losses__agree_between_cuda_and_llvm(masked):
                 observations["recon"], Target(target, mask if masked else None), 0.2
             ),
             "flow": flow_loss(
-                observations["flow"], from_numpy(mi.TensorXf, flow), reliable, pixels
+                observations["flow"], from_numpy(mi.TensorXf, flow), reliable, 1 / pixels
             ),
-            "mask": mask_loss(observations["mask"], reliable, pixels),
+            "mask": mask_loss(observations["mask"], reliable, 1 / pixels),
         }
         dr.backward(sum(losses.values()))
         gradients = {f"gradient of {name}": dr.grad(value) for name, value in observations.items()}
@@ -143,7 +145,7 @@ def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
         gaussians = Gaussians(**raw)
         region = Region.of(mask[..., 0] > 0)
         dr.enable_grad(*gaussians.items().values())
-        image = rasterize(gaussians, camera, CHANNELS, region=region)
+        image = render_view(gaussians, ActiveView(camera, region=region), CHANNELS)
         # Blocks have another shape on CUDA and thus reach further beyond the mask.
         weight = mi.TensorXf(region.crop(mask))
         color = image.color * weight

@@ -1,8 +1,8 @@
 """The layers of the package: a module imports only from its own subpackage and from those before
 it.
 
-`extras` is the last one, so nothing outside of it imports it. It enters registries by
-`core.extras`.
+`extras` is the last one, so nothing outside of it imports it, and no folder of it imports another.
+Each enters registries by `platform.extras`.
 """
 
 import ast
@@ -12,6 +12,7 @@ import morgs_mi
 
 ROOT = Path(morgs_mi.__file__).parent
 SUBPACKAGES = (
+    "platform",
     "core",
     "testing",
     "io",
@@ -83,10 +84,22 @@ def test_layers__imports_go_down():
     assert [mistake for path in MODULES for mistake in mistakes(path)] == []
 
 
+def test_layers__no_extra_imports_another():
+    mistakes = []
+    for path in (ROOT / "extras").rglob("*.py"):
+        place = path.relative_to(ROOT)
+        names = imported_names(
+            ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts]
+        )
+        others = {n[2] for n in names if n[:2] == ["morgs_mi", "extras"]} - {*place.parts[1:2]}
+        mistakes += [f"{place} imports from {name}" for name in others]
+    assert mistakes == []
+
+
 def test_layers__only_the_module_that_finds_extras_names_them():
     places = [
         path.relative_to(ROOT)
         for path in MODULES
         if "morgs_mi.extras" in path.read_text(encoding="utf-8")
     ]
-    assert [place for place in places if place.parts[0] != "extras"] == [Path("core/extras.py")]
+    assert [place for place in places if place.parts[0] != "extras"] == [Path("platform/extras.py")]

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import morgs_mi
 from morgs_mi.cli.main import COMMANDS
-from morgs_mi.core.bounded import read_json
-from morgs_mi.extras.synth.synth_config import SynthConfig
-from morgs_mi.extras.synth.synthesize import synthesize
+from morgs_mi.platform.bounded import read_json
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -21,10 +20,10 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 def workplace(tmp_path_factory):
     """Return a folder that holds a small capture where the demo writes its own."""
     folder = tmp_path_factory.mktemp("readme")
-    synthesize(
+    morgs_mi.synthesize(
         "spheres",
         folder / "out/demo/capture",
-        SynthConfig(cameras=3, frames=2, width=64, height=48, spp=4),
+        morgs_mi.SynthConfig(cameras=3, frames=2, width=64, height=48, spp=4),
     )
     return folder
 

@@ -11,10 +11,10 @@ import pytest
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.core.config import types_of
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.platform.config import types_of
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import random_sheet
@@ -27,7 +27,7 @@ BASE = StreamConfig(
         confidence_steps=6,
         epochs=6,
         density=DensityConfig(
-            rounds=2, births=0.05, max_gaussians=150, min_error=0, split_scale=0.03
+            rounds=2, births=0.05, max_gaussians=400, min_error=0, split_scale=0.03
         ),
     ),
     motion=MotionConfig(key_views=2, mask_interval=2),
@@ -36,13 +36,9 @@ BASE = StreamConfig(
 # Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
 VALUES = {
     "motion.flow_method": "dis-ultrafast",
-    "motion.mask_method": "superpixels+grabcut",
-    "fit.objective.rigid_weight": 1.0,
-    "fit.objective.rotation_weight": 1.0,
-    "fit.objective.isometry_weight": 1.0,
-    "fit.early_stopping_tolerance": 0.5,
+    "motion.mask_method": "none",
     "fit.dropout": 0.3,
-    "fit.density.max_gaussians": 1000,
+    "fit.density.max_gaussians": 150,
     "fit.density.split_scale": 1.0,
     "fit.density.min_opacity": 0.4,
     "motion.flow.fine_width": 32,
@@ -50,6 +46,8 @@ VALUES = {
     "motion.active_set.quiet_views": 1,
     "render.stop_transmittance": 0.5,
     "render.alpha_max": 0.5,
+    "motion.change.min_peak": 0.2,
+    "render.background": (0.1, 0.2, 0.3),
     "render.block_width": 4,
     "render.block_height": 8,
 }
@@ -69,6 +67,7 @@ ELSEWHERE = {
     "motion.search": "flow explains all parts here: tests/method/test_search.py",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
+    "fit.objective.terms": "the package has no further term: tests/fit/test_later_frame.py",
     "motion.model": "the package has no motion model: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "the recorder writes keyframes: tests/runs/test_fit_capture.py",
 }

@@ -1,5 +1,4 @@
-"""Check that an assignment binds one thing, that names of variables are nouns, and that tests patch
-public names.
+"""Check that an assignment binds one thing, and that tests patch public names.
 
 `python tools/check_dialect.py FOLDER...` prints a sentence for each violation, and exits with 1 if
 there is one.
@@ -11,51 +10,6 @@ import ast
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-
-# Participles and adverbs, which do not say what a variable holds. `left` is absent: it is also a
-# side.
-NO_NOUNS = (
-    *(
-        "about",
-        "after",
-        "apart",
-        "before",
-        "found",
-        "given",
-        "inside",
-        "kept",
-        "known",
-        "matched",
-        "moved",
-        "now",
-    ),
-    *("own", "seen", "taken", "then", "together", "used", "wanted"),
-)
-# Fields and parameters that stay, by file: other modules, scripts and files of results have these
-# names.
-EXCEPTIONS = {
-    "benchmarks/reports/cameras.py": {"given"},
-    "benchmarks/reports/field.py": {"found"},
-    "benchmarks/reports/plots.py": {"about"},
-    "morgs_mi/fit/balance.py": {"taken"},
-    "morgs_mi/extras/calibration/offset_equations.py": {"own"},
-    "morgs_mi/extras/calibration/refine.py": {"taken"},
-    "morgs_mi/extras/imports/import_frames.py": {"before", "now"},
-    "morgs_mi/extras/live/cameras.py": {"after"},
-    "morgs_mi/extras/synth/ground_truth.py": {"before", "after"},
-    "morgs_mi/extras/synth/sensor.py": {"own"},
-}
-
-
-def bound_name(node: ast.expr | ast.arg) -> str:
-    """Return the name of the variable, parameter or attribute that a node binds, without
-    underscores; or nothing.
-    """
-    if isinstance(node, ast.arg):
-        return node.arg.strip("_")
-    if not isinstance(node, ast.Name | ast.Attribute) or not isinstance(node.ctx, ast.Store):
-        return ""
-    return (node.id if isinstance(node, ast.Name) else node.attr).strip("_")
 
 
 def is_parallel(node: ast.Assign) -> bool:
@@ -82,15 +36,9 @@ def patches_private_name(node: ast.Call) -> bool:
     return is_patch and any(name.startswith("_") and not name.endswith("__") for name in last_parts)
 
 
-def violations(tree: ast.Module, exceptions: set[str]) -> Iterator[tuple[int, str]]:
-    """Yield the line and the sentence of each violation in a module; `exceptions` may stay."""
+def violations(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield the line and the sentence of each violation in a module."""
     for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.expr | ast.arg)
-            and (name := bound_name(node)) in NO_NOUNS
-            and name not in exceptions
-        ):
-            yield node.lineno, f"`{name}` must be a noun; name the variable by what it holds."
         if isinstance(node, ast.Call) and patches_private_name(node):
             yield node.lineno, "expected a public name to patch, got a private one; make it public."
         if isinstance(node, ast.Assign) and is_parallel(node):
@@ -117,7 +65,7 @@ def check(places: Sequence[str]) -> list[str]:
         return [f"expected modules to check, found none in {' '.join(places) or 'no arguments'}."]
     for path in paths:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        rows = sorted(violations(tree, EXCEPTIONS.get(path.as_posix(), set())))
+        rows = sorted(violations(tree))
         lines += [f"{path}:{number}: {sentence}" for number, sentence in rows]
     return lines
 

@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 [ "$(uname -s)" = Linux ] || exit 0 # on other systems Dr.Jit finds it by itself
-find_llvm() { "$1" -P morgs_mi/core/llvm.py >/dev/null; } # run as a file, because importing the package needs LLVM
+find_llvm() { "$1" -P morgs_mi/platform/llvm.py >/dev/null; } # run as a file, because importing the package needs LLVM
 
 if problem=$(find_llvm "$1" 2>&1); then
     [ -z "$problem" ] || echo "setup: $problem" >&2

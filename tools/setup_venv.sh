@@ -35,4 +35,7 @@ if [ ! -x "$venv/bin/python" ] || ! "$venv/bin/python" -c 'import pip' 2>/dev/nu
     fi
     "$python" -m venv --clear "$venv"
 fi
-"$venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,docs,notebooks,browser,usd,cluster]'
+log "Installing packages (1 to 3 min)"
+# Older ones, such as Debian 12's, do not show which package they install.
+"$venv/bin/python" -m pip install -q --disable-pip-version-check 'pip>=25.1'
+"$venv/bin/python" -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev,docs,notebooks,browser,usd,cluster]'

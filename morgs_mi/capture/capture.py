@@ -9,31 +9,90 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
+from morgs_mi.capture.layouts.calibration import CalibratedView
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_points, composed, few, quantity
 from morgs_mi.core.color_space import display_stops
-from morgs_mi.core.files import CAPTURE
 from morgs_mi.core.rig import with_near_planes
+from morgs_mi.core.view import View, Views
 from morgs_mi.io.clip_readers import FrameReader, open_clips
 from morgs_mi.io.images import ImageOrError
 from morgs_mi.io.prefetch import prefetched
+from morgs_mi.platform.bounded import JsonObject
+from morgs_mi.platform.checks import check_points, composed, few, quantity
+from morgs_mi.platform.files import CAPTURE
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
 MIN_SIDE = 32
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedView(View):
+    """A view of a recording: a camera with its clip."""
+
+    source: CameraSource = field(kw_only=True, repr=False)  #: The clip.
+    #: Radial terms k1, k2 of the distortion left in the images, which is removed as well.
+    distortion: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def recorded_size(self) -> tuple[int, int]:
+        """Width and height of the clip, px."""
+        return self.source.reader.width, self.source.reader.height
+
+    def with_camera(self, camera: Camera) -> RecordedView:
+        """Return the view with a camera of another size, and its mask."""
+        return replace(self, camera=camera, mask=self.source.mask(camera))
+
+    def at_recorded_size(self) -> RecordedView:
+        """Return the view without downscaling."""
+        return self.with_camera(self.camera.resized(*self.recorded_size))
+
+    def refined(self, camera: Camera, distortion: tuple[float, float]) -> RecordedView:
+        """Return the view with a refined camera, and images without a distortion left in them."""
+        size = self.recorded_size
+        recorded = self.camera.resized(*size), camera.resized(*size)
+        maps = undistortion(
+            recorded[0], self.source.lens, (recorded[1], Lens("RADIAL", distortion))
+        )
+        source = replace(self.source, undistortion=maps)
+        return replace(self, source=source, distortion=distortion).with_camera(camera)
+
+    def process(self, image: np.ndarray) -> np.ndarray:
+        """Return a recorded image [H, W, 3] as frames have it: undistorted, downscaled and
+        colour-corrected.
+        """
+        return self.source.process(image, self.camera)
+
+    def metadata(self) -> JsonObject:
+        """Return the reading of the clip in JSON types."""
+        camera = self.camera
+        source = self.source
+        delays = {"delay": camera.delay, "readout": camera.readout}
+        return {
+            "name": camera.name,
+            "first_frame": int(source.times.frame_indices[0]),
+            "recorded_size": list(self.recorded_size),
+            "size": [camera.width, camera.height],
+            "K": camera.K.tolist(),
+            "lens": source.lens.model,
+            "distortion": list(source.lens.distortion),
+            "undistortion": "none" if source.undistortion is None else "cubic, same intrinsics",
+            "valid_share": 1.0 if self.mask is None else float(self.mask.mean()),
+            **{name: value for name, value in delays.items() if value},
+        }
 
 
 @dataclass(frozen=True)
@@ -41,8 +100,23 @@ class Frame:
     """One timestamp in all views."""
 
     index: int  #: Position in the recording, from 0.
-    #: Per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light.
-    images: tuple[np.ndarray, ...]
+    #: The views with their images: uint8 in sRGB, or of EXR files float32 in linear light.
+    views: Views[View]
+
+    @property
+    def images(self) -> tuple[np.ndarray, ...]:
+        """Per camera [H, W, 3], RGB."""
+        return tuple(view.image for view in self.views)
+
+    @property
+    def train(self) -> Views[View]:
+        """The views that are fitted, with their images."""
+        return self.views.train
+
+    @property
+    def test(self) -> Views[View]:
+        """The views that are held out, with their images."""
+        return self.views.test
 
 
 @dataclass(frozen=True)
@@ -50,31 +124,40 @@ class PartialFrame:
     """One timestamp in the views that have an image of it."""
 
     index: int  #: Position in the recording, from 0.
-    images: tuple[np.ndarray | None, ...]  #: As in `Frame`, None for a missing image.
+    views: Views[View]  #: As in `Frame`; a view that lacks the image has none.
     problems: tuple[str, ...] = ()  #: One sentence per missing image.
-    #: Reference images for the next frame's images; None if these are `images`.
-    recorded: tuple[np.ndarray | None, ...] | None = None
+    #: Views with the images with which the next frame's are compared; None if these are `views`.
+    recorded: Views[View] | None = None
     #: Whether an image is missing that the recording should have.
     unread: bool = False
 
-    def check_images(self, views: Sequence[int]) -> None:
-        """Raise `OSError` if images of this timestamp could not be read, and none of some views is
-        left: the recording may have disappeared.
+    @property
+    def images(self) -> tuple[np.ndarray | None, ...]:
+        """Per camera [H, W, 3], RGB, or None for a missing image."""
+        return tuple(view.image if view.has_image else None for view in self.views)
+
+    @property
+    def train(self) -> Views[View]:
+        """The views that are fitted.
+
+        Raises:
+            OSError: images of this timestamp could not be read, and none of these views has one:
+                the recording may have disappeared.
         """
-        if self.unread and all(self.images[view] is None for view in views):
+        if self.unread and not any(view.has_image for view in self.views.train):
             raise OSError(
                 f"frame {self.index}: expected an image of at least one fitted camera, got none "
                 f"({self.problems[0].rstrip('.')}); bring the recording back, or end the fit "
                 f"before this frame (--frames {self.index})."
             )
+        return self.views.train
 
-    def comparable(self, views: Sequence[int]) -> list[np.ndarray | None]:
-        """Return the reference images of some views for the images of the next frame; errors of
-        `check_images`.
+    @property
+    def comparable(self) -> Views[View]:
+        """The views that are fitted with the images with which the next frame's are compared;
+        errors of `train`.
         """
-        self.check_images(views)
-        images = self.images if self.recorded is None else self.recorded
-        return [images[view] for view in views]
+        return self.train if self.recorded is None else self.recorded.train
 
 
 @dataclass(frozen=True)
@@ -83,42 +166,34 @@ class Capture:
 
     Attributes:
         path: the capture folder.
-        cameras: the views after undistortion and downscaling.
+        views: cameras after undistortion and downscaling, with masks of the pixels that were
+            recorded and are used; ``views.train`` are fitted, ``views.test`` are held out.
         num_frames: frames per camera.
         fps: frames per second.
         points: [P, 3] float32, world units; P = 0 if the layout has none.
         point_colors: [P, 3] float32 in [0, 1].
-        masks: per camera [H, W] bool, true where the undistorted pixel was recorded and is used;
-            None if all are.
-        test_views: indices of the cameras held out from training, in ascending order.
         truth: folder of ground truth, or None.
         downscale: the downscaling factor.
         layout: name of the folder's layout, e.g. ``COLMAP``.
         reading: how clips that do not match are read.
         notes: a sentence for each unexpected property of the clips, e.g. a variable frame rate.
-        distortions: per camera the radial terms k1, k2 of the distortion left in the images, which
-            is removed as well; empty if there is none.
         display_exposure: of EXR files, stops by which a display brightens them; None: the images
             have 8 bits.
-        origin: point [3] of the calibration's world, to which `cameras` and `points` are relative;
+        origin: point [3] of the calibration's world, to which cameras and points are relative;
             other than 0 if the rig is too far from 0 for float32.
     """
 
     path: Path
-    cameras: tuple[Camera, ...]
+    views: Views[RecordedView]
     num_frames: int
     fps: float
     points: np.ndarray
     point_colors: np.ndarray
-    masks: tuple[np.ndarray | None, ...]
-    test_views: tuple[int, ...]
     truth: Path | None
-    _sources: tuple[CameraSource, ...] = field(repr=False)
     downscale: float = 1
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
     notes: tuple[str, ...] = ()
-    distortions: tuple[tuple[float, float], ...] = ()
     display_exposure: float | None = None
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
@@ -126,25 +201,40 @@ class Capture:
         check_points(self.path, self.points, self.point_colors)
 
     def __repr__(self) -> str:
-        held_out = ", ".join(self.names[view] for view in self.test_views) or "none"
-        cameras = quantity(len(self.cameras), "camera")
+        held_out = ", ".join(view.name for view in self.views.test) or "none"
+        cameras = quantity(len(self.views), "camera")
         frames = f"{quantity(self.num_frames, 'frame')}, {self.fps:g} frames per second"
         return f"Capture('{self.path}', {self.layout}, {cameras}, {frames}, held out: {held_out})"
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the cameras."""
-        return tuple(camera.name for camera in self.cameras)
+        return tuple(view.name for view in self.views)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of all views."""
+        return self.views.cameras
+
+    @property
+    def masks(self) -> tuple[np.ndarray | None, ...]:
+        """The masks of all views."""
+        return tuple(view.mask for view in self.views)
 
     @property
     def train_views(self) -> tuple[int, ...]:
-        """Indices of the cameras that are not held out."""
-        return tuple(i for i in range(len(self.cameras)) if i not in self.test_views)
+        """Indices of the views that are not held out."""
+        return tuple(v for v, view in enumerate(self.views) if not view.held_out)
+
+    @property
+    def test_views(self) -> tuple[int, ...]:
+        """Indices of the views that are held out."""
+        return tuple(v for v, view in enumerate(self.views) if view.held_out)
 
     @property
     def first_clip(self) -> str:
         """Path of the first camera's video or folder of images, relative to the capture."""
-        return os.path.relpath(self._sources[0].reader.path, self.path)
+        return os.path.relpath(self.views[0].source.reader.path, self.path)
 
     @property
     def reference_view(self) -> int:
@@ -153,27 +243,22 @@ class Capture:
         """
         return self.test_views[0] if self.test_views else 0
 
-    @property
-    def recorded_sizes(self) -> tuple[tuple[int, int], ...]:
-        """Width and height of the cameras' clips."""
-        return tuple((source.reader.width, source.reader.height) for source in self._sources)
-
     def at_recorded_size(self) -> Capture:
         """Return the capture without downscaling, with the same points."""
         if self.downscale == 1:
             return self
-        cameras = tuple(
-            c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True)
-        )
-        return replace(self, cameras=cameras, masks=_masks(self._sources, cameras), downscale=1)
+        views = Views(view.at_recorded_size() for view in self.views)
+        return replace(self, views=views, downscale=1)
 
     def displayed(self) -> Capture:
         """Return the capture with images of 8 bits: linear light as a display shows it."""
         if self.display_exposure is None:
             return self
-        stops = self.display_exposure
-        sources = tuple(replace(source, display_exposure=stops) for source in self._sources)
-        return replace(self, _sources=sources, display_exposure=None)
+        views = []
+        for view in self.views:
+            source = replace(view.source, display_exposure=self.display_exposure)
+            views.append(replace(view, source=source))
+        return replace(self, views=Views(views), display_exposure=None)
 
     def with_cameras(
         self, cameras: Sequence[Camera], distortions: Sequence[Sequence[float]] = ()
@@ -185,17 +270,14 @@ class Capture:
             distortions: per camera the radial terms k1, k2 of the distortion left in the images,
                 which is removed as well; empty: none.
         """
-        rig = replace(self, cameras=tuple(cameras))
-        if not np.any(distortions):
-            return rig
-        radial_terms = tuple((float(k1), float(k2)) for k1, k2 in distortions)
-        rigs = (self.at_recorded_size().cameras, rig.at_recorded_size().cameras)
-        sources = []
-        for source, camera, refined, terms in zip(self._sources, *rigs, radial_terms, strict=True):
-            maps = undistortion(camera, source.lens, (refined, Lens("RADIAL", terms)))
-            sources.append(replace(source, undistortion=maps))
-        masks = _masks(sources, rig.cameras)
-        return replace(rig, masks=masks, _sources=tuple(sources), distortions=radial_terms)
+        pairs = zip(self.views, cameras, strict=True)
+        if np.any(distortions):
+            terms = [(float(k1), float(k2)) for k1, k2 in distortions]
+            changes = zip(pairs, terms, strict=True)
+            views = Views(view.refined(camera, term) for (view, camera), term in changes)
+        else:
+            views = Views(replace(view, camera=camera) for view, camera in pairs)
+        return replace(self, views=views)
 
     def holding_out(self, views: TestViews) -> Capture:
         """Return the capture with other held-out cameras, by indices or names; None for none.
@@ -203,19 +285,14 @@ class Capture:
         Raises:
             ValueError: there is no such camera, or none is left for training.
         """
-        return replace(self, test_views=held_out_views(self.path, views, self.names))
+        test = held_out_views(self.path, views, self.names)
+        pairs = enumerate(self.views)
+        return replace(self, views=Views(replace(view, held_out=v in test) for v, view in pairs))
 
-    def process(self, view: int, image: np.ndarray) -> np.ndarray:
-        """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like
-        its frames.
-        """
-        return self._sources[view].process(image, self.cameras[view])
-
-    def metadata(self) -> dict[str, Any]:
+    def metadata(self) -> JsonObject:
         """Return the reading of the frames in JSON types, as stored in the `capture.json` beside a
         stream.
         """
-        views = zip(self.cameras, self._sources, self.masks, strict=True)
         return {
             "capture": str(self.path),
             "layout": self.layout,
@@ -228,24 +305,7 @@ class Capture:
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
             "notes": list(self.notes),
             "origin": list(self.origin),
-            "cameras": [
-                {
-                    "name": camera.name,
-                    "first_frame": int(source.times.frame_indices[0]),
-                    "recorded_size": [source.reader.width, source.reader.height],
-                    "size": [camera.width, camera.height],
-                    "K": camera.K.tolist(),
-                    "lens": source.lens.model,
-                    "distortion": list(source.lens.distortion),
-                    "undistortion": "none"
-                    if source.undistortion is None
-                    else "cubic, same intrinsics",
-                    "valid_share": 1.0 if mask is None else float(mask.mean()),
-                    **({"delay": camera.delay} if camera.delay else {}),
-                    **({"readout": camera.readout} if camera.readout else {}),
-                }
-                for camera, source, mask in views
-            ],
+            "cameras": [view.metadata() for view in self.views],
         }
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
@@ -258,7 +318,7 @@ class Capture:
             FileNotFoundError: an image is missing.
         """
         for frame in prefetched(self._decoded(start, stop, True)):
-            yield Frame(frame.index, cast(tuple[np.ndarray, ...], frame.images))
+            yield Frame(frame.index, frame.views)
 
     def partial_frames(self, start: int = 0, stop: int | None = None) -> Iterator[PartialFrame]:
         """Yield frames start..stop-1 as `frames` does, with None for a missing image, which is
@@ -273,7 +333,7 @@ class Capture:
         missing image.
         """
         stop = self.num_frames if stop is None else min(stop, self.num_frames)
-        return self._sources[view].images(self.cameras[view], start, stop)
+        return self.views[view].source.images(self.cameras[view], start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Return the cameras of a stream of this capture with the delays and readouts of the
@@ -287,7 +347,7 @@ class Capture:
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
-        streams = [self.images(view, start, stop) for view in range(len(self.cameras))]
+        streams = [self.images(view, start, stop) for view in range(len(self.views))]
         missing: set[str] = set()
         try:
             for index, results in enumerate(zip(*streams, strict=True), start=start):
@@ -301,33 +361,29 @@ class Capture:
                 missing = set(errors)
                 # With gaps, timestamps without an image are part of the recording.
                 unread = bool(errors) and not (
-                    self.reading.gaps and os.path.exists(self._sources[0].reader.path)
+                    self.reading.gaps and os.path.exists(self.views[0].source.reader.path)
                 )
                 problems = tuple(f"{name}: {error}" for name, error in errors.items())
-                recorded = None
-                if index == 0 and any(source.times.delay for source in self._sources):
-                    # The motion in the first frame is unknown, so delays cannot be rendered. An
-                    # image that cannot be interpolated stays as it is.
-                    recorded = images
-                    first_images = list(images)
-                    for view, source in enumerate(self._sources):
-                        if images[view] is not None and source.times.delay:
-                            source = source.at_timestamps()
-                            result = next(source.images(self.cameras[view], 0, 1))
-                            if isinstance(result, np.ndarray):
-                                first_images[view] = result
-                    images = tuple(first_images)
-                yield PartialFrame(index, images, problems, recorded, unread)
+                views = self.views.at(images)
+                if index == 0 and any(view.source.times.delay for view in self.views):
+                    # The motion in the first frame is unknown, so delays cannot be rendered.
+                    first = Views(map(_at_timestamp, self.views, views))
+                    yield PartialFrame(index, first, problems, views, unread)
+                else:
+                    yield PartialFrame(index, views, problems, None, unread)
         finally:
             for stream in streams:
                 stream.close()
 
 
-def _masks(
-    sources: Sequence[CameraSource], cameras: Sequence[Camera]
-) -> tuple[np.ndarray | None, ...]:
-    """Return the masks of the valid pixels of cameras, None where all are valid."""
-    return tuple(map(CameraSource.mask, sources, cameras))
+def _at_timestamp(view: RecordedView, first: View) -> View:
+    """Return a view with the image of the first timestamp, interpolated if its clip has a delay;
+    one that cannot be interpolated stays as it is.
+    """
+    if not (first.has_image and view.source.times.delay):
+        return first
+    image = next(view.source.at_timestamps().images(view.camera, 0, 1))
+    return first.at(image) if isinstance(image, np.ndarray) else first
 
 
 def load_capture(
@@ -375,47 +431,47 @@ def load_capture(
     reader = find_reader(path)
     every = reader.read(path).centred(path)
     calibration = every.without(path, reading.without)
-    readers = open_clips(calibration.clips, reading.gaps, settings.get("white"))
-    recorded = _at_clip_sizes(path, calibration.cameras, readers)
-    names = [camera.name for camera in recorded]
-    common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
-    masks = calibration.masks or ((),) * len(readers)
-    sources = tuple(
-        map(CameraSource.of, readers, calibration.lenses, recorded, masks, common.clips)
+    opened = open_clips(
+        [view.clip for view in calibration.views], reading.gaps, settings.get("white")
     )
-    readouts: Any = settings.get("readout", 0.0)
-    if not isinstance(readouts, dict):
-        readouts = dict.fromkeys(names, readouts)
-    check_names(path / CAPTURE, "readout", readouts, every.names)
-    readouts = {composed(name): readout for name, readout in readouts.items()}
-    readouts = [readouts.get(name, 0.0) for name in names]
-    cameras = _downscaled_cameras(recorded, downscale, common.clips, readouts)
+    readers = dict(zip(calibration.names, opened, strict=True))
+    calibrated = _at_clip_sizes(path, calibration.views, readers)
+    common = timeline(path, readers, reading, max_frames, settings.get("fps"))
+    sources = [
+        CameraSource.of(readers[v.name], v.lens, v.camera, v.masks, common.clips[v.name])
+        for v in calibrated
+    ]
+    readouts = _readouts(path / CAPTURE, settings.get("readout", 0.0), every.names)
+    _check_downscale(downscale, [view.camera for view in calibrated])
+    cameras = [
+        _downscaled(view.camera, downscale, common.clips[view.name], readouts.get(view.name, 0.0))
+        for view in calibrated
+    ]
     cameras = with_near_planes(cameras, calibration.points, reading.near)
-    notes = [*common.notes, *(note for source in sources for note in source.notes)]
-    photos = [clip[0] for clip in calibration.clips if isinstance(clip, tuple) and len(clip) == 1]
-    if len(photos) == len(readers) and len({file.parent for file in photos}) == 1:
-        notes.append(
-            f"{len(photos)} photos of a static scene, one per camera; a recording has {EXAMPLE}"
-        )
+    test = held_out_by(path, test_view, settings, every, calibration)
     capture = Capture(
         path=path,
-        cameras=cameras,
-        num_frames=len(common.clips[0].frame_indices),
+        views=Views(
+            RecordedView(camera, mask=source.mask(camera), held_out=v in test, source=source)
+            for v, (camera, source) in enumerate(zip(cameras, sources, strict=True))
+        ),
+        num_frames=common.num_frames,
         fps=common.fps,
         points=calibration.points,
         point_colors=calibration.point_colors,
-        masks=_masks(sources, cameras),
-        test_views=held_out_by(path, test_view, settings, every, calibration),
         # The frames of the ground truth are numbered like the frames of the clips.
         truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
-        _sources=sources,
         downscale=downscale,
         layout=reader.name,
         reading=reading,
-        notes=tuple(notes),
+        notes=(
+            *common.notes,
+            *(n for source in sources for n in source.notes),
+            *_photos(calibrated),
+        ),
         origin=calibration.origin,
     )
-    if any(reader.has_light for reader in readers):
+    if any(reader.has_light for reader in opened):
         stops = settings.get("display_exposure")
         if stops is None:
             stops = display_stops(next(capture.partial_frames(0, 1)).images)
@@ -424,16 +480,18 @@ def load_capture(
 
 
 def _at_clip_sizes(
-    path: Path, cameras: Sequence[Camera], readers: Sequence[FrameReader]
-) -> list[Camera]:
-    """Return the cameras at the sizes of their clips, with a warning if a size differs.
+    path: Path, views: Sequence[CalibratedView], readers: Mapping[str, FrameReader]
+) -> list[CalibratedView]:
+    """Return the views with cameras at the sizes of their clips, with a warning if a size differs.
 
     Raises:
         ValueError: a clip has another aspect ratio than its camera.
     """
     recorded = []
     scaled = []
-    for camera, reader in zip(cameras, readers, strict=True):
+    for view in views:
+        camera = view.camera
+        reader = readers[view.name]
         width = reader.width
         height = reader.height
         # Both sides were rounded to whole pixels.
@@ -443,9 +501,9 @@ def _at_clip_sizes(
                 f"{camera.name}, or a scaled version of it, got {width}x{height}; calibrate at "
                 "the size of the images."
             )
-        recorded.append(camera.resized(width, height))
+        recorded.append(replace(view, camera=camera.resized(width, height)))
         if (width, height) != camera.size:
-            scaled.append(recorded[-1])
+            scaled.append(recorded[-1].camera)
     if scaled:
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
@@ -458,16 +516,20 @@ def _at_clip_sizes(
     return recorded
 
 
-def _downscaled_cameras(
-    recorded: Sequence[Camera],
-    downscale: float,
-    clips: Sequence[ClipTimes],
-    readouts: Sequence[float],
-) -> list[Camera]:
-    """Return the downscaled cameras of clips, with their delays and readouts: `readouts` are in
-    frames of the clips, the cameras' in timestamps.
+def _readouts(file: Path, setting: Any, names: Sequence[str]) -> dict[str, float]:
+    """Return the readouts of cameras by their names, in frames of the clips; `setting` is a number
+    for all of them, or an object with some.
     """
-    shortest = min(min(camera.width, camera.height) for camera in recorded)
+    readouts: JsonObject = dict.fromkeys(names, setting)
+    if isinstance(setting, dict):
+        readouts = setting
+    check_names(file, "readout", readouts, names)
+    return {composed(name): readout for name, readout in readouts.items()}
+
+
+def _check_downscale(downscale: float, cameras: Sequence[Camera]) -> None:
+    """Check that downscaled images have the least size."""
+    shortest = min(min(camera.width, camera.height) for camera in cameras)
     if downscale > 1 and round(shortest / downscale) < MIN_SIDE:
         largest = shortest / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
@@ -475,9 +537,20 @@ def _downscaled_cameras(
             f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
             f"side, got {downscale:g}; {remedy}."
         )
-    cameras = []
-    for camera, times, readout in zip(recorded, clips, readouts, strict=True):
-        size = (round(camera.width / downscale), round(camera.height / downscale))
-        delay = times.delay / times.rate
-        cameras.append(replace(camera.resized(*size), delay=delay, readout=readout / times.rate))
-    return cameras
+
+
+def _downscaled(camera: Camera, downscale: float, times: ClipTimes, readout: float) -> Camera:
+    """Return the downscaled camera of a clip with its delay and its readout, which is in frames of
+    the clip and of the camera in timestamps.
+    """
+    size = (round(camera.width / downscale), round(camera.height / downscale))
+    delay = times.delay / times.rate
+    return replace(camera.resized(*size), delay=delay, readout=readout / times.rate)
+
+
+def _photos(views: Sequence[CalibratedView]) -> list[str]:
+    """Return a note if the clips are photos, one per camera, in one folder."""
+    photos = [v.clip[0] for v in views if isinstance(v.clip, tuple) and len(v.clip) == 1]
+    if len(photos) < len(views) or len({file.parent for file in photos}) > 1:
+        return []
+    return [f"{len(photos)} photos of a static scene, one per camera; a recording has {EXAMPLE}"]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.layouts.calibration import Calibration
-from morgs_mi.core.checks import view_index
-from morgs_mi.core.files import CAPTURE
+from morgs_mi.platform.checks import view_index
+from morgs_mi.platform.files import CAPTURE
 
 TestViews = int | str | Sequence[int | str] | None
 """Held-out cameras: an index, a name, several of these, None for none, or "auto"."""
@@ -38,13 +38,14 @@ def held_out_by(
     """
     if requested != "auto":
         return held_out_views(path, requested, subset.names)
-    views = every.test_views or ()
+    names = every.held_out or ()
     if "test_view" in settings:
         views = _indices(path / CAPTURE, settings["test_view"], every.names)
         if not views:
             return ()
-    names = [every.names[view] for view in views if every.names[view] in subset.names]
-    if not names and every.test_views != () and len(subset.names) >= _MANY:
+        names = [every.names[view] for view in views]
+    names = [name for name in names if name in subset.names]
+    if not names and every.held_out != () and len(subset.names) >= _MANY:
         return (0,)
     return held_out_views(path, names, subset.names)
 

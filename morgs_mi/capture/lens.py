@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.platform.checks import LARGEST, bounded
 
 # Per COLMAP model, in the order of its binary ids: the number of focal lengths and of coefficients.
 MODELS = {

@@ -7,24 +7,16 @@ downscaled. Smaller images have fewer and less exact features.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.features import Features, Match, detect, match_views, triangulate
-from morgs_mi.capture.guided_matching import match_guided
-from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.random_streams import Stream, rng_of
-
-# px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of
-# pixels.
-MAX_ERROR = 2.0
-# A view that matches fewer others without its pose is also matched with it, which takes longer.
-_MIN_PARTNERS = 3
+from morgs_mi.fit.features import Features, Match, detect, match_views
+from morgs_mi.fit.image_points import matched_points
+from morgs_mi.fit.stereo import stereo_points
 
 
 @dataclass(frozen=True)
@@ -67,17 +59,7 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """
     cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if not set(capture.test_views) & set(match.views)]
-    # Unmatched pairs of views that match few others.
-    matched_pairs = {match.views for match in matches}
-    partners = Counter(view for pair in matched_pairs for view in pair)
-    few = {view for view in capture.train_views if partners[view] < _MIN_PARTNERS}
-    pairs = combinations(capture.train_views, 2)
-    matches += match_guided(
-        shared.features,
-        cameras,
-        [pair for pair in pairs if pair not in matched_pairs and few & set(pair)],
-    )
-    points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
+    points, colors = matched_points(shared.features, matches, cameras, capture.train_views)
     return replace(capture, points=points, point_colors=colors)
 
 
@@ -91,12 +73,8 @@ def dense_points(capture: Capture, sparse: Capture, seed: int = 0) -> Capture:
         seed: seed of the selection of stereo points.
     """
     recorded = capture.at_recorded_size()
-    images = next(recorded.displayed().partial_frames(0, 1)).images
-    views = [
-        (recorded.cameras[v], image, recorded.masks[v])
-        for v in capture.train_views
-        if (image := images[v]) is not None
-    ]
+    train = next(recorded.displayed().partial_frames(0, 1)).views.train
+    views = [view for view in train if view.has_image]
     points, colors = stereo_points(views, sparse.points, rng_of(seed, Stream.POINTS))
     points = np.concatenate([sparse.points, points])
     colors = np.concatenate([sparse.point_colors, colors])

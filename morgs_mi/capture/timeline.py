@@ -16,7 +16,7 @@ nearest frame is used unchanged: it is always later by the same time, the camera
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import lcm
 from pathlib import Path
@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.layouts.clips import check_names
-from morgs_mi.core.bounded import read_json, warn_unread
-from morgs_mi.core.checks import check_number, composed, few
-from morgs_mi.core.config import config_class
 from morgs_mi.io.clip_readers import FrameReader
+from morgs_mi.platform.bounded import read_json, warn_unread
+from morgs_mi.platform.checks import check_number, composed, few
+from morgs_mi.platform.config import config_class
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
@@ -80,17 +80,21 @@ class ClipTimes:
 class Timeline:
     """Frames of each clip that show the timestamps of the recording."""
 
-    clips: tuple[ClipTimes, ...]  #: Of each camera's clip.
+    clips: Mapping[str, ClipTimes]  #: Of each camera's clip, by the camera's name.
     fps: float  #: Timestamps per second.
     unchanged: bool  #: Whether timestamp t is frame t of every clip.
     #: A sentence for each clip of variable frame rate, and on the numbers of images.
     notes: tuple[str, ...] = ()
 
+    @property
+    def num_frames(self) -> int:
+        """Number of timestamps."""
+        return len(next(iter(self.clips.values())).frame_indices)
+
 
 def timeline(
     path: Path,
-    names: Sequence[str],
-    readers: Sequence[FrameReader],
+    readers: Mapping[str, FrameReader],
     config: ReadConfig,
     max_frames: int | None,
     fps: float | None,
@@ -99,8 +103,7 @@ def timeline(
 
     Args:
         path: the capture folder, for messages.
-        names: names of the cameras.
-        readers: one clip per camera.
+        readers: the clips by the names of their cameras.
         config: how clips that do not match are read.
         max_frames: number of timestamps at most.
         fps: actual frame rate of all clips, or None for the rates in their headers.
@@ -110,52 +113,58 @@ def timeline(
             clip is cut off, the clips have no timestamp in common, or `config` names an unknown
             camera or has an offset that is not finite.
     """
-    check_names(path, "offset", config.offset, names)
+    check_names(path, "offset", config.offset, [*readers])
     config = replace(config, offset={composed(name): o for name, o in config.offset.items()})
-    exact, notes = _by_numbers(path, names, readers, config, _clocks(names, readers, config, fps))
-    notes += _notes_of_clips(names, readers)
+    exact, notes = _by_numbers(path, readers, config, _clocks(readers, config, fps))
+    notes += _notes_of_clips(readers)
     if not config.offset:
-        notes += _time_codes(names, readers)
+        notes += _time_codes(readers)
     for note in notes:
         _LOG.warning("%s: %s", path, note)
     if config.trim or config.offset:
         clocks = _without_drift(exact, readers, max_frames)
-        timestamps = _common_timestamps(path, names, readers, config, clocks)[:max_frames]
+        timestamps = _common_timestamps(path, readers, config, clocks)[:max_frames]
     else:
         clocks = replace(exact, rates=np.ones(len(readers)))
-        timestamps = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
+        count = _num_frames(path, [*readers.values()], max_frames, config.gaps)
+        timestamps = np.arange(count, dtype=float)
         # Frames with the same index must be simultaneous.
         drift = np.ptp(exact.rates) * (len(timestamps) - 1)
         if drift > _NEAR:
-            rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
+            rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers.values() if r.fps)
             raise ValueError(
                 f"{path}: all cameras must have the same frame rate, got {rates}, up to "
                 f"{drift:.1f} frames apart; use the lowest one with --trim, or set `fps` in "
                 "capture.json."
             )
-    positions = clocks.offsets[:, None] + clocks.rates[:, None] * timestamps
-    offsets = [config.offset.get(name, 0) for name in names]
-    clips = list(map(_clip_times, readers, positions, clocks.rates.tolist(), offsets))
-    if config.gaps:
-        # Images that are far from their timestamps are left out.
-        for c, clip in enumerate(clips):
-            far = np.abs(_image_positions(readers[c], clip, positions[c]) - positions[c]) > _NEAR
-            clips[c] = replace(clip, frame_indices=np.where(far, -1, clip.frame_indices))
+    clips = {}
+    times = np.zeros((len(readers), len(timestamps)))
+    has_frame = np.zeros(times.shape, bool)
+    for c, (name, reader) in enumerate(readers.items()):
+        positions = clocks.offsets[c] + clocks.rates[c] * timestamps
+        clip = _clip_times(reader, positions, float(clocks.rates[c]), config.offset.get(name, 0))
+        places = _image_positions(reader, clip, positions)
+        if config.gaps:
+            # Images that are far from their timestamps are left out.
+            is_far = np.abs(places - positions) > _NEAR
+            clip = replace(clip, frame_indices=np.where(is_far, -1, clip.frame_indices))
+        clips[name] = clip
+        times[c] = (places - exact.offsets[c]) / exact.rates[c]
+        has_frame[c] = clip.frame_indices >= 0
     # Images of one timestamp that are apart, by the clips' clocks.
-    places = np.array(list(map(_image_positions, readers, clips, positions)))
-    times = (places - exact.offsets[:, None]) / exact.rates[:, None]
-    has_frame = np.stack([clip.frame_indices >= 0 for clip in clips])
     latest = np.where(has_frame, times, -np.inf).max(axis=0)
     earliest = np.where(has_frame, times, np.inf).min(axis=0)
     spread = float(np.max(latest - earliest, initial=0)) / exact.fps
     if spread > 1e-3:
         _LOG.warning("%s: images of one timestamp are up to %.1f ms apart.", path, 1e3 * spread)
     unchanged = not any(config.offset.values()) and all(
-        np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices))) for clip in clips
+        np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices)))
+        for clip in clips.values()
     )
-    for reader, clip in zip(readers, clips, strict=True):
+    for name, reader in readers.items():
         if reader.positions is not None and reader.fps:
-            frames = clip.frame_indices[clip.frame_indices >= 0]
+            frames = clips[name].frame_indices
+            frames = frames[frames >= 0]
             repeats = len(frames) - len(np.unique(frames))
             late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
             notes.append(
@@ -164,24 +173,23 @@ def timeline(
                 f"{1e3 * late:.1f} ms off; each timestamp has the frame nearest in time: {repeats} "
                 f"repeat one, {len(timestamps) - len(frames)} have none."
             )
-    return Timeline(tuple(clips), exact.fps, unchanged, tuple(notes))
+    return Timeline(clips, exact.fps, unchanged, tuple(notes))
 
 
 def _by_numbers(
     path: Path,
-    names: Sequence[str],
-    readers: Sequence[FrameReader],
+    readers: Mapping[str, FrameReader],
     config: ReadConfig,
     clocks: _Clocks,
 ) -> tuple[_Clocks, list[str]]:
     """Return the clocks of clips by the numbers of their images, too, and a sentence for each
     assumption.
     """
-    numbers = {c: clip.numbers for c, clip in enumerate(readers) if clip.numbers is not None}
+    numbers = {name: clip.numbers for name, clip in readers.items() if clip.numbers is not None}
     moving = any(len(clip) > 1 for clip in numbers.values())
     if not moving or len({(clip[0], clip.step) for clip in numbers.values()}) == 1:
         return clocks, []
-    table = ", ".join(f"{names[c]} {_range(clip)}" for c, clip in numbers.items())
+    table = ", ".join(f"{name} {_range(clip)}" for name, clip in numbers.items())
     if config.offset and not config.trim:
         note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
         return clocks, [note]
@@ -194,7 +202,7 @@ def _by_numbers(
         raise ValueError(
             f"{path}: images with the same number must be simultaneous and all cameras must have "
             f"the same numbers, got {table}; use {remedy if common else ''}the positions of the "
-            f"images in place of their numbers with --offset {names[next(iter(numbers))]} 0."
+            f"images in place of their numbers with --offset {next(iter(numbers))} 0."
         )
     note = (
         f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
@@ -203,7 +211,7 @@ def _by_numbers(
     steps = [clip.step for clip in numbers.values()]
     # Other clips start with the first of these numbers.
     first = min(clip[0] for clip in numbers.values())
-    clips = [numbers.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
+    clips = [numbers.get(name, range(first, first + 1, min(steps))) for name in readers]
     offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
     return _Clocks(
         clocks.offsets + offsets * clocks.rates,
@@ -213,24 +221,26 @@ def _by_numbers(
     ), [note]
 
 
-def _notes_of_clips(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
+def _notes_of_clips(readers: Mapping[str, FrameReader]) -> list[str]:
     """Return the notes of the clips, each with the cameras that have it."""
     cameras: dict[str, list[str]] = {}
-    for name, reader in zip(names, readers, strict=True):
+    for name, reader in readers.items():
         for note in reader.notes:
             cameras.setdefault(note, []).append(name)
     return [f"{few(cameras[note])}: {note}" for note in cameras]
 
 
-def _time_codes(names: Sequence[str], readers: Sequence[FrameReader]) -> list[str]:
+def _time_codes(readers: Mapping[str, FrameReader]) -> list[str]:
     """Return a sentence if overlapping clips began at different times by their time codes."""
-    fps, starts, counts = np.array([(r.fps, r.start, r.num_frames) for r in readers], float).T
+    rows = [(reader.fps, reader.start, reader.num_frames) for reader in readers.values()]
+    fps, starts, counts = np.array(rows, float).T
     spread = np.ptp(starts)
     offsets = np.rint((starts[0] - starts) * fps)
     # Comparisons are false if a time code or a rate is unknown.
     if not (offsets.any() and spread < (counts / fps).min()):
         return []
-    options = " ".join(f"{names[c]} {offsets[c]:g}" for c in np.flatnonzero(offsets).tolist())
+    pairs = zip(readers, offsets, strict=True)
+    options = " ".join(f"{name} {offset:g}" for name, offset in pairs if offset)
     return [
         f"The time codes of the clips begin up to {spread:.3g} s apart; if they were synchronised, "
         f"align the clips with --offset {options}."
@@ -281,17 +291,12 @@ class _Clocks:
     fps: float
 
 
-def _clocks(
-    names: Sequence[str],
-    readers: Sequence[FrameReader],
-    config: ReadConfig,
-    fps: float | None,
-) -> _Clocks:
+def _clocks(readers: Mapping[str, FrameReader], config: ReadConfig, fps: float | None) -> _Clocks:
     """Return the clocks of the clips by their offsets and their frame rates."""
-    clip_fps = [fps or reader.fps for reader in readers]
+    clip_fps = [fps or reader.fps for reader in readers.values()]
     lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
-    offsets = np.array([config.offset.get(name, 0) for name in names], float)
-    for c, reader in enumerate(readers):
+    offsets = np.array([config.offset.get(name, 0) for name in readers], float)
+    for c, reader in enumerate(readers.values()):
         if reader.positions is not None:
             # Of a frame before the first or after the last one, too.
             index = round(float(offsets[c]))
@@ -301,7 +306,7 @@ def _clocks(
 
 
 def _without_drift(
-    clocks: _Clocks, readers: Sequence[FrameReader], max_frames: int | None
+    clocks: _Clocks, readers: Mapping[str, FrameReader], max_frames: int | None
 ) -> _Clocks:
     """Return the clocks with a whole rate r for each clip that differs from it by less than half a
     frame in the end.
@@ -310,7 +315,7 @@ def _without_drift(
     is then constant.
     """
     periods = min(
-        _periods(reader) / rate for reader, rate in zip(readers, clocks.rates, strict=True)
+        _periods(reader) / rate for reader, rate in zip(readers.values(), clocks.rates, strict=True)
     )
     whole = np.maximum(1, np.rint(clocks.rates))
     drift = np.abs(whole - clocks.rates) * (min(periods, max_frames or periods) - 1)
@@ -319,18 +324,19 @@ def _without_drift(
 
 def _common_timestamps(
     path: Path,
-    names: Sequence[str],
-    readers: Sequence[FrameReader],
+    readers: Mapping[str, FrameReader],
     config: ReadConfig,
     clocks: _Clocks,
 ) -> np.ndarray:
     """Return the timestamps that all clips cover [T]."""
     # A truncated clip can be trimmed but not shifted.
     is_held = config.trim and not config.gaps
-    for reader in () if config.gaps or config.trim else readers:
-        _check_complete(reader, reader.num_frames)
+    clips = readers.values()
+    if not (config.gaps or config.trim):
+        for reader in clips:
+            _check_complete(reader, reader.num_frames)
     lengths = np.array(
-        [r.num_held if is_held and r.positions is None else _periods(r) for r in readers]
+        [r.num_held if is_held and r.positions is None else _periods(r) for r in clips]
     )
     first = np.ceil(np.max(-clocks.offsets / clocks.rates))
     last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
@@ -339,7 +345,7 @@ def _common_timestamps(
         spans = spans / (clocks.rates * clocks.fps)[:, None]
         table = ", ".join(
             f"{name} {start:.2f} to {stop:.2f} s"
-            for name, (start, stop) in zip(names, spans, strict=True)
+            for name, (start, stop) in zip(readers, spans, strict=True)
         )
         raise ValueError(f"{path}: the clips have no timestamp in common, {table}; check `offset`.")
     return np.arange(first, last + 1)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.core.bounded import array_names, read_array
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.listing import existing_file
+from morgs_mi.platform.bounded import array_names, read_array
 
 _CHANNELS = ("motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y")
 

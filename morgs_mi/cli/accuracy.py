@@ -39,9 +39,9 @@ class Accuracy:
     drop_invalid: DropInvalid = False
 
     def run(self) -> None:
-        from morgs_mi.core.files import write_json
-        from morgs_mi.core.plots import check_plot
         from morgs_mi.evaluate.accuracy import accuracy
+        from morgs_mi.platform.files import write_json
+        from morgs_mi.platform.plots import check_plot
         from morgs_mi.playback.stream_header import find_camera
 
         stream = opened(self.source, self.drop_invalid)

@@ -20,6 +20,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    SpinnerColumn,
     Task,
     TaskID,
     TextColumn,
@@ -27,7 +28,11 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from morgs_mi.core.progress import Report, duration
+from morgs_mi.platform.progress import Report, duration, name_of, time_left
+
+STDOUT = "standard output"
+"""Name of standard output in errors."""
+_PERIOD = 30.0  # seconds between two lines of progress without a terminal
 
 
 def printable(text: str) -> str:
@@ -56,14 +61,11 @@ class _Console(Console):
         return super().render_str(printable(text), **{**options, "markup": False})
 
 
-STDOUT = "standard output"
-"""Name of standard output in errors."""
 OUT = _Console()
 ERR = _Console(stderr=True)
 
 # Errors that the user can correct; any other is a fault of the package, or of a library.
 _EXPECTED = (ValueError, OSError, MemoryError, ArithmeticError)
-_PERIOD = 30.0  # seconds between two lines of progress without a terminal
 
 
 @contextmanager
@@ -180,7 +182,8 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
 
 @contextmanager
 def progress() -> Iterator[Report]:
-    """Show a progress bar per stage, or without a terminal a line every 30 s.
+    """Show a progress bar per stage, which ends where the next one begins, or without a terminal a
+    line every 30 s.
 
     The context is a function to call with (stage, done, total).
     """
@@ -188,6 +191,7 @@ def progress() -> Iterator[Report]:
         yield _line_report()
         return
     columns = (
+        SpinnerColumn(finished_text=" "),
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
@@ -196,14 +200,20 @@ def progress() -> Iterator[Report]:
     tasks: dict[str, TaskID] = {}
     with Progress(*columns, console=ERR) as bars:
 
+        def end_stages() -> None:
+            for task in tasks.values():  # a stage may end before its last step
+                bars.update(task, completed=bars.tasks[task].total)
+
         def report(stage: str, done: float, total: float) -> None:
-            if stage not in tasks:  # what was done before is not part of its pace
-                tasks[stage] = bars.add_task(stage, total=total, completed=int(done))
-            bars.update(tasks[stage], completed=done, total=total)
+            name = name_of(stage)
+            if name not in tasks:
+                end_stages()
+                tasks[name] = bars.add_task(stage, total=total, completed=int(done))
+                bars.update(tasks[name], base=bars.tasks[tasks[name]].percentage)
+            bars.update(tasks[name], description=stage, completed=done, total=total)
 
         yield report
-        for task in tasks.values():  # a stage may end before its last step
-            bars.update(task, completed=bars.tasks[task].total)
+        end_stages()
 
 
 class _Time(ProgressColumn):
@@ -211,9 +221,9 @@ class _Time(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         """Return the time in words."""
-        left = None if task.finished else task.time_remaining
-        seconds = task.finished_time if task.finished else task.elapsed
-        return Text(duration(seconds or 0) if left is None else f"about {duration(left)} left")
+        seconds = task.finished_time or task.elapsed or 0
+        left = time_left(seconds, task.percentage, 100, task.fields.get("base", 0))
+        return Text(f"about {duration(left)} left" if left else duration(seconds))
 
 
 def _line_report() -> Report:
@@ -224,14 +234,15 @@ def _line_report() -> Report:
     def report(stage: str, done: float, total: float) -> None:
         nonlocal last
         moment = time.monotonic()
-        start, base = begin.setdefault(stage, (moment, done))
+        start, base = begin.setdefault(name_of(stage), (moment, done))
         if moment - last < _PERIOD:
             return
         last = moment
         seconds = moment - start
         line = f"{stage}: {int(done)}/{total:.0f}, {duration(seconds)} elapsed"
-        if done > base:  # at the pace of the steps that are done
-            line += f", about {duration(seconds * (total - done) / (done - base))} left"
+        left = time_left(seconds, done, total, base)
+        if left is not None:
+            line += f", about {duration(left)} left"
         print_warning(f"{line}.")
 
     return report

@@ -39,10 +39,10 @@ class Eval:
     """
 
     def run(self) -> None:
-        from morgs_mi.core.environment import machine, versions
-        from morgs_mi.core.extras import extra
-        from morgs_mi.core.files import json_finite, write_json
         from morgs_mi.evaluate.evaluate import evaluate_stream
+        from morgs_mi.evaluate.lpips import Lpips
+        from morgs_mi.platform.environment import machine, versions
+        from morgs_mi.platform.files import json_finite, write_json
         from morgs_mi.playback.streams import spans
 
         folder = self.source if self.source.is_dir() else self.source.parent
@@ -57,7 +57,7 @@ class Eval:
             )
         network = None
         if self.lpips is not None:
-            network = extra("image distances", "lpips")(self.lpips)
+            network = Lpips(self.lpips)
         with progress() as report:
             frames = partial(report, "Evaluating frames")
             result = evaluate_stream(self.source, self.capture, frames, network, self.any_recording)

@@ -23,15 +23,18 @@ from morgs_mi.cli.streams import (
     Background,
     DropInvalid,
     ExportKind,
-    Front,
+    PageCamera,
     on_background,
     opened,
+    print_between,
+    print_view,
     relative_to,
+    rendering,
     shown_exposure,
 )
-from morgs_mi.core.checks import quantity
-from morgs_mi.core.extras import extra, places
-from morgs_mi.core.progress import Report
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.extras import extra, places
+from morgs_mi.platform.progress import Report
 from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
 
 if TYPE_CHECKING:
@@ -97,6 +100,10 @@ class Flight(ExportKind):
     formats = VIDEO
     drawn = True
 
+    def run(self, stream: FrameSource) -> None:
+        super().run(stream)
+        print_between(stream)
+
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import (
             flight,
@@ -122,7 +129,7 @@ class Flight(ExportKind):
             flight(stream, path, self.channels, frames),
             stream.fps,
             output,
-            lambda done: report("Rendering", done, count),
+            rendering(report, count),
             shown_exposure(stream, self.display_exposure),
         )
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
@@ -137,11 +144,16 @@ class Web(ExportKind):
     by default player.html or web beside the stream."""
     title: Annotated[str | None, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
-    front: Front = None
+    camera: PageCamera = None
     background: Background = None
 
     formats = WEB
     drawn = True
+
+    def run(self, stream: FrameSource) -> None:
+        super().run(stream)
+        print_between(stream)
+        print_view(stream, self.camera)
 
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import frame_numbers
@@ -154,8 +166,8 @@ class Web(ExportKind):
                 "unchanged."
             )
         on_background(stream, self.background)
-        if self.front is not None:
-            first = find_camera(stream, self.front)
+        if self.camera is not None:
+            first = find_camera(stream, self.camera)
             stream.cameras = (first, *(c for c in stream.cameras if c is not first))
         total = len(frame_numbers(stream))
         write = write_web_folder if chosen.folder else write_web_page

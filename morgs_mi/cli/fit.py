@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -24,13 +25,14 @@ from morgs_mi.cli.settings import (
     optional,
     options,
 )
-from morgs_mi.core.checks import quantity
-from morgs_mi.core.config import Count, check_value, config_toml
-from morgs_mi.core.files import STREAM
-from morgs_mi.core.progress import duration
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.config import config_toml
+from morgs_mi.platform.files import STREAM
 
 if TYPE_CHECKING:
+    from morgs_mi.capture.capture import Capture
     from morgs_mi.loop.frame_report import FrameReport
+    from morgs_mi.loop.stream_config import StreamConfig
 
 
 @options
@@ -62,11 +64,6 @@ class Fit:
     """Print all settings as TOML and exit."""
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
-    chunks: Annotated[int | None, optional("INT", "(default: 1)")] = None
-    """Number of parts of the recording that are fitted side by side, by the extra cluster; each
-    begins with a keyframe."""
-    scheduler: Annotated[str | None, optional("ADDRESS")] = None
-    """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/cluster.md)."""
 
     groups: ClassVar[Mapping[str, Sequence[str]]] = {
         "input": ("frames", "downscale", "trim", "offset", "gaps", "exclude", "near"),
@@ -99,44 +96,28 @@ class Fit:
                 "before options with several values, such as --hold-out. `morgs-mi demo OUT` makes "
                 "a capture and fits it."
             )
-        if self.chunks is not None:
-            check_value("fit()", "chunks", self.chunks, Count)
         self.settings.check_methods(config)
         views = held_out(self.hold_out)
         reading = self.reading.read_config()
         capture = load_capture(self.capture, self.downscale, views, self.frames, reading)
-        if self.chunks is not None or self.scheduler is not None:
-            from morgs_mi.core.threads import usable_cores
-            from morgs_mi.runs.cluster.chunks import ChunkedRun, noting_chunks
-            from morgs_mi.runs.cluster.tasks import ChunkConfig
-            from morgs_mi.runs.cluster.workers import open_client
-
-            chunks = ChunkConfig(self.chunks or 1)
-            with (
-                noting_chunks(self.out),
-                progress() as report,
-                open_client(self.scheduler, min(chunks.count, usable_cores())) as client,
-            ):
-                run = ChunkedRun(capture, self.out, client, config, chunks, report)
-                reports = run.fit(self.resume)
-        else:
-            from morgs_mi.runs.fit_capture import stream_capture
-
-            stream = self.out / STREAM
-            begin = time.monotonic()
-
-            @cache
-            def announce() -> None:
-                if ERR.is_terminal:
-                    seconds = duration(time.monotonic() - begin)
-                    print_warning(f"After {seconds} there is a picture: see `morgs-mi view`.")
-
-            with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
-                reports = stream_capture(
-                    capture, self.out, config, self.resume, report, lambda _: announce()
-                )
+        reports = self.fit(capture, self.out, config)
         _print_summary(self.out / STREAM, reports)
         print_next("view", self.out)
+
+    def fit(self, capture: Capture, out: Path, config: StreamConfig) -> list[FrameReport]:
+        """Fit a capture into a folder, and return the reports of the frames in its stream."""
+        from morgs_mi.runs.fit_capture import stream_capture
+
+        stream = out / STREAM
+        command = shlex.join(["morgs-mi", "view", str(out)])
+
+        @cache
+        def announce() -> None:
+            if ERR.is_terminal:
+                print_warning(f"A first picture is ready: {command}")
+
+        with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
+            return stream_capture(capture, out, config, self.resume, report, lambda _: announce())
 
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
@@ -174,6 +155,8 @@ def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
         yield validation["exposure"]["sentence"]
     if "sentence" in validation:
         yield validation["sentence"]
+    if "draft" in validation:
+        yield validation["draft"]["sentence"]
 
 
 @contextmanager

@@ -49,9 +49,9 @@ from morgs_mi.cli.settings import (
     one_command,
     options,
 )
-from morgs_mi.cli.view import View
-from morgs_mi.core.extras import extra, places
-from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
+from morgs_mi.cli.view import ViewStream
+from morgs_mi.platform.extras import extra, places
+from morgs_mi.platform.interrupts import INTERRUPTED, interruptible, is_interruption
 
 # Exit status of a shell for a program whose reader has ended, such as `head`.
 _CLOSED = 141
@@ -62,7 +62,7 @@ COMMANDS = {
     "fit": Fit,
     "render": Render,
     "export": Export,
-    "view": View,
+    "view": ViewStream,
     "eval": Eval,
     "accuracy": Accuracy,
     **{name: extra("commands", name) for name in places("commands")},
@@ -74,6 +74,7 @@ OLD_OPTIONS = {
     "--color": "went: --exposure balances the cameras",
     "--completion": "is now --tyro-write-completion bash FILE",
     "--deep": "went: `info` checks the poses, and --time finds the time offsets",
+    "--front": "is now --camera",
     "--format": "went: the name of the output determines the format",
     "--key-views": "is now `key_views` in `[motion]` of a file of settings (--config)",
     "--open-browser": "is now --browser",

@@ -24,9 +24,9 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.config import apply_values, read_config, relocated
-from morgs_mi.core.documentation import field_docs, with_pages
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
+from morgs_mi.platform.config import apply_values, read_config, relocated
+from morgs_mi.platform.documentation import field_docs, with_pages
 
 # The setting of every option. All others are set in a file.
 SETTINGS = {
@@ -57,6 +57,10 @@ Flag = Annotated[bool, FlagCreatePairsOff]
 Without = Annotated[tuple[str, ...], arg(metavar="CAMERA ...")]
 # Names or indices of held-out cameras.
 HeldOut = Annotated[tuple[str, ...], arg(metavar="CAMERA ...")]
+_STOPS = (
+    "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a "
+    "recording of 8 bits."
+)
 
 
 def held_out(names: Sequence[str]) -> TestViews:
@@ -95,10 +99,6 @@ def optional(metavar: str, hint: str | None = None) -> Any:
     return arg(metavar=metavar, help_behavior_hint=hint)
 
 
-_STOPS = (
-    "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a "
-    "recording of 8 bits."
-)
 DisplayExposure = Annotated[float | None, arg(metavar="STOPS", help=_STOPS)]
 """Option of the commands that render a stream."""
 
@@ -228,8 +228,8 @@ class Settings:
     target_size: Annotated[int | None, setting("target_size")] = None
     """Most bytes of a later frame; 0: no limit."""
     preset: Annotated[PresetName | None, optional("NAME"), one_of(get_args(PresetName))] = None
-    """Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, ml-mo,
-    ml-mo-mc (its ablation), or rigidity (rigid neighbours, docs/experiments/field.md).
+    """Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, or ml,
+    ml-mo, ml-mo-mc (its ablation).
     """
     config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as --print-config writes it."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -12,7 +13,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import options
-from morgs_mi.core.progress import Report
+from morgs_mi.platform.progress import Progress, Report, duration
+from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.formats import Format, destination
 
 if TYPE_CHECKING:
@@ -34,8 +36,8 @@ _BACKGROUND = (
 )
 Background = Annotated[str | None, arg(metavar="COLOR", help=_BACKGROUND)]
 """Option of the commands that draw a stream."""
-_FRONT = "Camera at which the page opens, by name or index; by default the first one."
-Front = Annotated[str | None, arg(metavar="CAMERA", help=_FRONT)]
+_CAMERA = "Camera at which the page opens, by name or index; by default the first one."
+PageCamera = Annotated[str | None, arg(metavar="CAMERA", help=_CAMERA)]
 """Option of the commands that show a page."""
 _COLORS = {"black": "#000000", "grey": "#808080", "white": "#ffffff"}
 
@@ -82,6 +84,45 @@ def opened(
     if drawn and isinstance(stream, SplatFile) and stream.cameras_file is not None:
         print_warning(f"Cameras: {stream.cameras_file}.")
     return stream
+
+
+def print_view(stream: FrameSource, choice: str | None, more: str = "") -> None:
+    """Print from where Gaussians without a recording are seen, unless the user has chosen it, and
+    the cameras that may be chosen, of which `more` is no name.
+    """
+    if choice is None and stream.metadata.get(DEFAULT_RIG) is True:
+        first, *others = [camera.name for camera in stream.cameras]
+        print_result(f"Seen from {first} (most detail); also --camera {', '.join(others)}{more}.")
+
+
+def print_between(stream: FrameSource) -> None:
+    """Print what the fit expects of views between the cameras."""
+    from morgs_mi.playback.stream_header import between_cameras
+
+    if quality := between_cameras(stream):
+        print_result(f"Views between the cameras: {quality}.")
+
+
+def rendering(report: Report, count: int) -> Callable[[int], None]:
+    """Return the function that is called with the number of images done, of `count`.
+
+    What all take is forecast from the second and third image, because the first one may wait for
+    the compiler.
+    """
+    stage = Progress(report, "Rendering")
+    stage(0, count)
+    begin = time.monotonic()
+
+    def show(done: int) -> None:
+        nonlocal stage, begin
+        if done == 1:
+            begin = time.monotonic()
+        elif done == 3:
+            seconds = (time.monotonic() - begin) / 2 * count
+            stage = stage.forecast("Rendering", f", {count} images in about {duration(seconds)}")
+        stage(done, count)
+
+    return show
 
 
 def shown_exposure(stream: FrameSource, stops: float | None) -> float:

@@ -11,11 +11,11 @@ from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
 from morgs_mi.cli.settings import optional, options
-from morgs_mi.cli.streams import DropInvalid, Front, opened
+from morgs_mi.cli.streams import DropInvalid, PageCamera, opened, print_view
 
 
 @options
-class View:
+class ViewStream:
     """View a stream or a file of Gaussians in the browser; a stream even during its fit."""
 
     source: Positional[Path]
@@ -30,7 +30,7 @@ class View:
     """Open the page in the browser of this machine."""
     follow: bool = False
     """Begin at the newest frame."""
-    front: Front = None
+    camera: PageCamera = None
     capture: Annotated[Path | None, optional("FOLDER")] = None
     """Folder of the capture with the recorded images; by default the one that was fitted."""
     drop_invalid: DropInvalid = False
@@ -41,11 +41,12 @@ class View:
 
         stream = opened(self.source, self.drop_invalid)
         wishes = ["follow"] if self.follow else []
-        if self.front is not None:
-            wishes.append(f"camera={quote(find_camera(stream, self.front).name)}")
+        if self.camera is not None:
+            wishes.append(f"camera={quote(find_camera(stream, self.camera).name)}")
         viewer = Viewer(stream, self.host, self.port, self.capture)
         url = f"{viewer.url}#{'&'.join(wishes)}" if wishes else viewer.url
         print_result(f"{url} (Ctrl-C to stop)")
+        print_view(stream, self.camera)
         if viewer.is_public:
             print_result(
                 "Other machines open the same link with the address of this machine in digits."

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from morgs_mi.core.config import NonNegativeInt, Positive, config_class
+from morgs_mi.platform.config import NonNegativeInt, Positive, config_class
 
 
 @config_class

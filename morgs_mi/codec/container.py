@@ -42,12 +42,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from morgs_mi.core.bounded import most_memory
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, bounded, numbers
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.png import PngImage, png_bytes
 from morgs_mi.core.types import Arrays
+from morgs_mi.platform.bounded import JsonObject, most_memory
+from morgs_mi.platform.checks import LARGEST, bounded, numbers
+from morgs_mi.platform.png import PngImage, png_bytes
 
 _MAX_BYTES = 2**26  # most of them in strings
 _MAX_MARKS = 2**20  # commas and brackets
@@ -67,9 +67,21 @@ _CAMERA = {
     "height": (int, 1, _MAX_PIXELS, "an integer from 1 to 2^26"),
     "near": (float, 1 / LARGEST, LARGEST, "a number from 1e-12 to 1e12"),
 }
+MAGIC = b"MORGS-MI"
+INDEX_MAGIC = b"MORGSIDX"
+VERSION = 2
+PREAMBLE = struct.Struct("<8sI")
+HEAD = struct.Struct("<IIQ")  # kind, frame, payload length; the CRC covers these and the payload
+ENTRY = struct.Struct("<IIQ")  # kind, frame, offset
+TRAILER = struct.Struct("<Q8s")
+_U32 = struct.Struct("<I")
+PAYLOAD = HEAD.size + _U32.size  # offset of the payload in a packet
+_DTYPES = {"float32": "<f4", "uint32": "<u4", "uint8": "u1"}
+_MAX_TABLE = 2**16  # bytes
+_MAX_AXES = 8
 
 
-def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, Any]) -> str:
+def header_json(cameras: Sequence[Camera], fps: float, metadata: JsonObject) -> str:
     """Return a header's payload as JSON.
 
     Raises:
@@ -96,7 +108,7 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     return text
 
 
-def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
+def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, JsonObject]:
     """Return cameras, frame rate and metadata of a header's payload.
 
     Raises:
@@ -208,20 +220,6 @@ def _entries(
             raise ValueError(f"`{where}{key}` must be {words}, got {value!r:.60}")
         entries.append(value)
     return entries
-
-
-MAGIC = b"MORGS-MI"
-INDEX_MAGIC = b"MORGSIDX"
-VERSION = 2
-PREAMBLE = struct.Struct("<8sI")
-HEAD = struct.Struct("<IIQ")  # kind, frame, payload length; the CRC covers these and the payload
-ENTRY = struct.Struct("<IIQ")  # kind, frame, offset
-TRAILER = struct.Struct("<Q8s")
-_U32 = struct.Struct("<I")
-PAYLOAD = HEAD.size + _U32.size  # offset of the payload in a packet
-_DTYPES = {"float32": "<f4", "uint32": "<u4", "uint8": "u1"}
-_MAX_TABLE = 2**16  # bytes
-_MAX_AXES = 8
 
 
 class PacketKind(IntEnum):
@@ -342,7 +340,7 @@ class StreamWriter:
         sink: str | Path | BinaryIO,
         cameras: Sequence[Camera],
         fps: float,
-        metadata: Mapping[str, Any] | None = None,
+        metadata: JsonObject | None = None,
     ) -> None:
         payload = header_json(cameras, fps, metadata or {}).encode()
         self.num_bytes = 0

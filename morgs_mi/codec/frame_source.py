@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from morgs_mi.codec.container import Packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.platform.bounded import JsonObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class FrameSource(Protocol):
     path: Path
     cameras: tuple[Camera, ...]
     fps: float
-    metadata: dict[str, Any]
+    metadata: JsonObject
 
     def __iter__(self) -> Iterator[Packet]: ...
 

@@ -47,9 +47,9 @@ from morgs_mi.codec.quantisation import (
     step_sizes,
 )
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Arrays
+from morgs_mi.platform.config import config_or_default
 
 # Flags of the geometry of a Gaussian that dies; the first three groups are the bits below, all
 # others those above.
@@ -59,6 +59,12 @@ _DEAD = 8
 # was decoded from.
 _THRESHOLD = 0.99
 _THRESHOLD_DC = 0.5
+# An entropy code stores a column of one value in almost no bytes. A small packet must not request
+# much memory: it has a word for each 16 Gaussians that it adds, or for each 16 of their integers if
+# the state has more than 2^22. The integers of a fit take about four bits each, twice as much.
+_PER_WORD = 16
+_FREE_INTEGERS = 2**22
+_MAX_QUANTIZER_STEP = 80  # quarter octaves: a million times the step
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +146,6 @@ def _classes(grid: Grid) -> list[np.ndarray]:
         np.zeros(len(grid), bool) if confidence is None else grid.values[:, confidence.start] > 0
     )
     return [np.flatnonzero(~moving), np.flatnonzero(moving)]
-
-
-# An entropy code stores a column of one value in almost no bytes. A small packet must not request
-# much memory: it has a word for each 16 Gaussians that it adds, or for each 16 of their integers if
-# the state has more than 2^22. The integers of a fit take about four bits each, twice as much.
-_PER_WORD = 16
-_FREE_INTEGERS = 2**22
-_MAX_QUANTIZER_STEP = 80  # quarter octaves: a million times the step
 
 
 @dataclass(frozen=True, eq=False)

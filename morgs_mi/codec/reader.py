@@ -29,8 +29,8 @@ from morgs_mi.codec.container import (
 )
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.packets import CodedFrame, coded_frames
-from morgs_mi.core.bounded import open_regular
-from morgs_mi.core.checks import quantity
+from morgs_mi.platform.bounded import open_regular
+from morgs_mi.platform.checks import quantity
 
 _READ_SIZE = 2**20
 

@@ -1,3 +1,1 @@
-"""Foundations of all subpackages: cameras, Gaussians, the attribute table, colour spaces, atomic
-files.
-"""
+"""Foundations of the renderer and the method: Gaussians, cameras, colours, geometry, arrays."""

@@ -17,6 +17,12 @@ import numpy as np
 
 from morgs_mi.core.types import Jit
 
+# px, in the camera that magnifies a Gaussian most: a step of the stream, twice the error, is about
+# a tenth of a pixel.
+_ERROR_PX = 0.04
+# Of 1: the error of an image of 8 bits.
+_ERROR_COLOR = 1 / 255
+
 
 def sigmoid(x: Jit) -> Jit:
     """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""
@@ -84,12 +90,6 @@ class Attribute:
         """
         return -1 if -1 in self.shape else math.prod(self.shape)
 
-
-# px, in the camera that magnifies a Gaussian most: a step of the stream, twice the error, is about
-# a tenth of a pixel.
-_ERROR_PX = 0.04
-# Of 1: the error of an image of 8 bits.
-_ERROR_COLOR = 1 / 255
 
 # The stream's columns have the same order.
 ATTRIBUTES: tuple[Attribute, ...] = (

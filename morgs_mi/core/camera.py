@@ -8,14 +8,16 @@ x [0, height].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.checks import (
+from morgs_mi.core.color_space import BRIGHTEST, unit_values
+from morgs_mi.core.types import SceneDict, Tensor
+from morgs_mi.platform.checks import (
     LARGEST,
     bounded,
     check_number,
@@ -24,9 +26,10 @@ from morgs_mi.core.checks import (
     numbers,
     require,
 )
-from morgs_mi.core.color_space import BRIGHTEST, unit_values
-from morgs_mi.core.png import PngImage
-from morgs_mi.core.types import Tensor
+from morgs_mi.platform.png import PngImage
+
+if TYPE_CHECKING:
+    import mitsuba as mi  # imported where a sensor is read
 
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
 _OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -181,7 +184,7 @@ class Camera:
         return view if isinstance(view, Camera) else cls.from_sensor(view)
 
     @classmethod
-    def from_sensor(cls, sensor: Any) -> Camera:
+    def from_sensor(cls, sensor: mi.Sensor) -> Camera:
         """Return the view of a Mitsuba `perspective` sensor, without gradients: the inverse of
         `sensor`.
 
@@ -302,6 +305,8 @@ class Camera:
 
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""
+        if (width, height) == self.size:
+            return self
         K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
         image = self.backdrop
         if image is not None:
@@ -323,7 +328,7 @@ class Camera:
         """
         return self.resized(self.width, max(1, round(self.height * self.K[0, 0] / self.K[1, 1])))
 
-    def sensor(self, **film: Any) -> dict[str, Any]:
+    def sensor(self, **film: Any) -> SceneDict:
         """Return a Mitsuba `perspective` sensor dictionary of this view.
 
         Keyword arguments override entries of the film (e.g. ``rfilter``, ``pixel_format``).

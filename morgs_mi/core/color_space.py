@@ -19,11 +19,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from morgs_mi.core.types import Color3f
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,13 +61,13 @@ def decode_light(encoded: np.ndarray) -> np.ndarray:
     return np.where(encoded > 1, np.exp((np.maximum(encoded, 1) - 1) / _SLOPE), srgb)
 
 
-def encode_traced(linear: Any) -> Any:
+def encode_traced(linear: Color3f) -> Color3f:
     """Return `encode_light` of a Dr.Jit array, differentiable."""
     srgb = mi.math.linear_to_srgb(dr.select(linear > 1, 1, linear))
     return dr.select(linear > 1, 1 + _SLOPE * dr.log(dr.select(linear > 1, linear, 1)), srgb)
 
 
-def decode_traced(encoded: Any) -> Any:
+def decode_traced(encoded: Color3f) -> Color3f:
     """Return `decode_light` of a Dr.Jit array, differentiable."""
     srgb = mi.math.srgb_to_linear(dr.select(encoded > 1, 1, encoded))
     return dr.select(
@@ -74,7 +75,7 @@ def decode_traced(encoded: Any) -> Any:
     )
 
 
-def unit_values(image: np.ndarray, dtype: type[np.floating[Any]] = np.float64) -> np.ndarray:
+def unit_values(image: np.ndarray, dtype: type[np.floating] = np.float64) -> np.ndarray:
     """Return encoded values of an image as floats, white being 1: uint8 is divided by 255, floats
     are such values.
     """

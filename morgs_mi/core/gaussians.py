@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from morgs_mi.core.arrays import concatenated, float_tensor, from_numpy, rows_of
 from morgs_mi.core.attributes import (
     ATTRIBUTES,
     BY_ACTIVATED_NAME,
@@ -22,9 +23,11 @@ from morgs_mi.core.attributes import (
     SIGMOID,
     sigmoid,
 )
-from morgs_mi.core.checks import numbers, require
-from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Arrays, Bool, Float, Tensor, Tensors, UInt32
+from morgs_mi.platform.checks import numbers, require
+
+# Numbers up to which a sum is read by another kernel instead of made by one of its own.
+_MOST_READ = 4
 
 
 class ActivatedGaussians(Protocol):
@@ -97,7 +100,7 @@ def displaced(gaussians: Gaussians, displacement: np.ndarray) -> Gaussians:
 
 def at_rest(gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians with a motion and an offset of zero."""
-    zero = np.zeros((len(gaussians), 3))
+    zero = dr.zeros(mi.TensorXf, (len(gaussians), 3))
     return replace(gaussians, motion=zero, offset=zero)
 
 
@@ -142,7 +145,9 @@ class _Columns(dr.CustomOp):
 
     def backward(self) -> None:
         grads = cast(list[Float], self.grad_out())
-        total = dr.zeros(mi.Float, self.width)
+        # No row is read twice: as many as there are means all of them.
+        is_whole = self.active is True and dr.width(self.index) * self.size == self.width
+        total = (dr.empty if is_whole else dr.zeros)(mi.Float, self.width)
         kind, step = (mi.Vector4f, 4) if self.size % 4 == 0 else (mi.Vector1f, 1)
         count = self.size // step
         for j in range(count):
@@ -169,7 +174,16 @@ class _RepeatEach(dr.CustomOp):
         return dr.repeat(x, count)
 
     def backward(self) -> None:
-        self.set_grad_in("x", dr.block_sum(self.grad_out(), self.count))
+        grads = cast(Float, self.grad_out())
+        if self.count > _MOST_READ:
+            self.set_grad_in("x", dr.block_sum(grads, self.count))
+            return
+        # Read by the kernel that needs the sum, and added in the order of `dr.block_sum`.
+        first = dr.arange(mi.UInt32, dr.width(grads) // self.count) * self.count
+        parts = [dr.gather(mi.Float, grads, first + k) for k in range(self.count)]
+        if self.count == _MOST_READ:
+            parts = [parts[0] + parts[2], parts[1] + parts[3]]
+        self.set_grad_in("x", sum(parts[1:], parts[0]))
 
     def forward(self) -> None:
         self.set_grad_out(dr.repeat(self.grad_in("x"), self.count))
@@ -235,12 +249,16 @@ class Gaussians:
 
     def __repr__(self) -> str:
         more = [name for name in self.items() if name in ("motion", "logit_confidence", "offset")]
-        size = "0"
-        if len(self):
-            means = np.asarray(dr.detach(self.means))
-            size = " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0))
-        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {size}", *more]
+        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {self.size}", *more]
         return f"Gaussians({', '.join(parts)})"
+
+    @property
+    def size(self) -> str:
+        """Sides of the box around the means, world units, such as ``2 x 1 x 0.25``; 0 of none."""
+        if not len(self):
+            return "0"
+        sides = np.ptp(np.asarray(dr.detach(self.means)), axis=0)
+        return " x ".join(f"{side:.3g}" for side in sides)
 
     @classmethod
     def from_activated(
@@ -373,7 +391,13 @@ class Gaussians:
 
     def select(self, index: np.ndarray) -> Gaussians:
         """Return the Gaussians at `index` [M] (integers, or a mask [N]), without gradients."""
-        return Gaussians(**{name: value[index] for name, value in self.numpy().items()})
+        rows = np.arange(len(self))[index]
+        if not len(rows):
+            return Gaussians(**{name: value[rows] for name, value in self.numpy().items()})
+        lanes = from_numpy(mi.UInt32, rows)
+        values = {name: rows_of(value, lanes) for name, value in self.items().items()}
+        dr.eval(values)
+        return Gaussians(**values)
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
@@ -382,7 +406,7 @@ class Gaussians:
         Raises:
             ValueError: there are no parts, or they have different attributes.
         """
-        columns = [part.numpy() for part in parts]
+        columns = [part.detached().items() for part in parts]
         require(
             len({tuple(column) for column in columns}) == 1,
             "Gaussians.concatenate()",
@@ -390,9 +414,13 @@ class Gaussians:
             [sorted(column) for column in columns],
             "drop or add `motion`, `offset` and `logit_confidence`",
         )
-        return Gaussians(
-            **{k: np.concatenate([column[k] for column in columns]) for k in columns[0]}
-        )
+        count = sum(map(len, parts))
+        values = {}
+        for name, first in columns[0].items():
+            numbers = concatenated([column[name].array for column in columns])
+            values[name] = mi.TensorXf(numbers, (count, *first.shape[1:]))
+        dr.eval(values)
+        return Gaussians(**values)
 
 
 def split_sh(sh_coeffs: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from morgs_mi.core.camera import Camera, unit_vectors
-from morgs_mi.core.checks import require
+from morgs_mi.platform.checks import require, view_index
 
 # Rows and columns of the points of each view.
 _GRID = 16
@@ -184,16 +184,28 @@ def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
     return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
 
 
-def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
-    """Return the indices of `count` views spread over the rig, or of all if there are fewer.
+def choose_key_views(
+    cameras: Sequence[Camera], selection: int | tuple[str, ...]
+) -> tuple[int, ...]:
+    """Return the indices of the views with these names, or of this number of views spread over the
+    rig, or of all if there are fewer.
 
-    The first is the most central one; each further one is the farthest from the earlier ones.
+    Of a number, the first is the most central one; each further one is the farthest from the
+    earlier ones.
+
+    Raises:
+        ValueError: no view has a name.
     """
+    if isinstance(selection, tuple):
+        names = [camera.name for camera in cameras]
+        place = "StreamLoop()"
+        views = (view_index(place, "`motion.key_views`", name, names) for name in selection)
+        return tuple(sorted({*views}))
     if not cameras:
         return ()
     positions = positions_of(cameras)
     views = [int(np.argmin(central_distances(positions)))]
-    while len(views) < min(count, len(cameras)):
+    while len(views) < min(selection, len(cameras)):
         distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
         views.append(int(np.argmax(distance)))
     return tuple(sorted(views))

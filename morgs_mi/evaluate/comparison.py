@@ -15,6 +15,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, exposed
+from morgs_mi.core.rig import angles_to, scene_depths
 from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.metrics import recorded_change
 from morgs_mi.playback.player import has_confidence, render
@@ -35,6 +36,8 @@ class ComparedClip:
     packets: Mapping[int, tuple[PacketKind, int]]  #: Kind and size of each frame's packet.
     #: The evaluated views: the held-out ones, or otherwise all training views.
     views: Sequence[int]
+    #: Of each held-out view, the training view at the least angle from it, as seen from the scene.
+    nearest: Mapping[int, int]
     cameras: Sequence[Camera]  #: Of all views, with the delays of the recording.
     channels: Sequence[str]  #: Rendered channels.
     render: RenderConfig  #: Settings of the renderer, as in the fit.
@@ -60,7 +63,16 @@ class ComparedClip:
         views = recording.test_views or recording.train_views
         channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
         cameras = recording.with_delays(stream.cameras)
-        return cls(stream, recording, packets, views, cameras, channels, render_config(stream))
+        return cls(
+            stream,
+            recording,
+            packets,
+            views,
+            _nearest_views(recording, cameras),
+            cameras,
+            channels,
+            render_config(stream),
+        )
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
@@ -76,6 +88,15 @@ class ComparedClip:
             ]
             yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)
             last = images
+
+
+def _nearest_views(recording: Capture, cameras: Sequence[Camera]) -> dict[int, int]:
+    depths = scene_depths(cameras, recording.points)
+    train_cameras = [cameras[view] for view in recording.train_views]
+    angles = {
+        view: angles_to(cameras[view], depths[view], train_cameras) for view in recording.test_views
+    }
+    return {view: recording.train_views[values.argmin()] for view, values in angles.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +126,11 @@ class ComparedFrame:
                 last_image = None if self.last is None else self.last[index]
                 if last_image is not None and clip.recording.truth is None:
                     moving = recorded_change(last_image, image)
+                nearest = clip.nearest.get(index)
+                copy = None if nearest is None else self.images[nearest]
                 light = None if clip.recording.display_exposure is None else self.recorded[index]
-                yield ComparedView(
-                    self, index, maps, image, clip.recording.masks[index], moving, truth, light
-                )
+                valid = clip.recording.masks[index]
+                yield ComparedView(self, index, maps, image, valid, moving, truth, light, copy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +145,8 @@ class ComparedView:
     moving: np.ndarray | None  #: Moving pixels [H, W] bool; None: unknown.
     truth: GroundTruth | None  #: Ground truth; None: unknown.
     light: np.ndarray | None = None  #: Image of an HDR recording [H, W, 3], linear; None of others.
+    #: Of a held-out view, the recorded image of the nearest training view [H', W', 3], uint8.
+    nearest: np.ndarray | None = None
 
     @property
     def camera(self) -> Camera:

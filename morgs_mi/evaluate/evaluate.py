@@ -11,20 +11,21 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.fingerprint import image_fingerprints
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.checks import require
-from morgs_mi.core.files import REPORT
-from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.progress import Steps
 from morgs_mi.evaluate.comparison import ComparedClip
+from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.measures import (
-    ImageDistance,
     Motion3D,
     Quality,
     Variation,
 )
 from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.files import REPORT
+from morgs_mi.platform.interrupts import interrupts_raised
+from morgs_mi.platform.progress import StepReport
 from morgs_mi.playback.player import playback_speed
+from morgs_mi.playback.stream_header import between_cameras
 from morgs_mi.playback.streams import PlayableStream, open_stream
 
 _UNKNOWN = (None, 0, ())  # Of a frame without a report.
@@ -34,8 +35,8 @@ _UNKNOWN = (None, 0, ())  # Of a frame without a report.
 def evaluate_stream(
     out: str | Path,
     capture: str | Path | None = None,
-    progress: Steps | None = None,
-    lpips: ImageDistance | None = None,
+    progress: StepReport | None = None,
+    lpips: Lpips | None = None,
     any_recording: bool = False,
 ) -> Evaluation:
     """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all
@@ -89,31 +90,31 @@ def evaluate_stream(
         rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds, **scores))
         if progress is not None:
             progress(len(rows), len(clip.packets))
-    num_fitted = len(recording.train_views)
+    num_fitted = len(recording.views.train)
+    without_images = [
+        row.frame
+        for row in rows
+        if np.isnan(row.scores.psnr) or fitted.get(row.frame, _UNKNOWN)[1] == num_fitted
+    ]
     num_bytes = stream.path.stat().st_size
+    sizes = Sizes(
+        file=num_bytes,
+        overhead=num_bytes - sum(row.num_bytes for row in rows),
+        per_frame=num_bytes / len(rows),
+        per_keyframe=known_mean([row.num_bytes for row in rows if row.kind == "keyframe"]),
+        per_residual=known_mean([row.num_bytes for row in rows if row.kind == "residual"]),
+    )
+    playback = playback_speed(stream, stream.cameras[clip.views[0]], clip.render)
     return Evaluation(
         stream=str(stream.path.resolve()),
         capture=str(recording.path.resolve()),
         held_out=bool(recording.test_views),
+        between_cameras=between_cameras(stream),
         complete=len(rows) == stream.metadata.get("num_frames", len(rows)),
-        without_images=tuple(
-            row.frame
-            for row in rows
-            if np.isnan(row.scores.psnr) or fitted.get(row.frame, _UNKNOWN)[1] == num_fitted
-        ),
+        without_images=tuple(without_images),
         regions="recorded change" if recording.truth is None else "true masks",
-        sizes=Sizes(
-            num_bytes,
-            num_bytes - sum(row.num_bytes for row in rows),
-            num_bytes / len(rows),
-            *(
-                known_mean([row.num_bytes for row in rows if row.kind == kind])
-                for kind in ("keyframe", "residual")
-            ),
-        ),
-        playback=PlaybackTimes(
-            **playback_speed(stream, stream.cameras[clip.views[0]], clip.render)
-        ),
+        sizes=sizes,
+        playback=PlaybackTimes(**playback),
         frames=tuple(rows),
         **ChainMap(*(measure.result() for measure in measures)),
     )

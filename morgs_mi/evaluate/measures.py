@@ -12,16 +12,17 @@ until the next. Otherwise it is the pixels in which the recording changed by mor
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 
 from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
-from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
+from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import (
     WINDOW,
     StillVariation,
@@ -38,7 +39,10 @@ from morgs_mi.evaluate.metrics import (
 from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.results import VariationScores, ViewScores
 from morgs_mi.method.exposure import follow_exposure
+from morgs_mi.platform.checks import valid_pixels
 
+Fields: TypeAlias = dict[str, Any]
+"""Fields of a result by their names."""
 REGIONS = ("", "_moving", "_still")
 # Compression flickers: after a hundred frames half the pixels of a real recording have changed
 # once.
@@ -51,23 +55,13 @@ class Measure:
     def add_view(self, view: ComparedView) -> None:
         """Add a view of the next frame."""
 
-    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+    def add_frame(self, frame: ComparedFrame) -> Fields:
         """Add the next frame, after its views; return its scores as fields of `FrameScores`."""
         return {}
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> Fields:
         """Return the scores of the clip as fields of `Evaluation`."""
         return {}
-
-
-class ImageDistance(Protocol):
-    """Perceptual distance between images, such as LPIPS."""
-
-    def distance_map(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return the distance of two images [H, W, 3] in [0, 1], pixel by pixel [H, W] or as one
-        number.
-        """
-        ...
 
 
 class Quality(Measure):
@@ -77,7 +71,7 @@ class Quality(Measure):
         lpips: network for LPIPS; without one there is no LPIPS.
     """
 
-    def __init__(self, lpips: ImageDistance | None) -> None:
+    def __init__(self, lpips: Lpips | None) -> None:
         self._lpips = lpips
         self._views: dict[str, ViewScores] = {}
         self._psnr: list[float] = []
@@ -99,14 +93,14 @@ class Quality(Measure):
                 scores["confidence_iou"] = iou(view.maps["confidence"][..., 0] > 0.5, mask)
         self._views[view.camera.name] = ViewScores(**scores)
 
-    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+    def add_frame(self, frame: ComparedFrame) -> Fields:
         names = [frame.clip.cameras[view].name for view in frame.clip.views]
         views = {name: self._views.pop(name, ViewScores()) for name in names}
         mean = ViewScores.mean(list(views.values()))
         self._psnr.append(mean.psnr)
         return {"scores": mean, "views": views}
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> Fields:
         return {"psnr_slope": slope(self._psnr)}
 
 
@@ -123,7 +117,7 @@ class Variation(Measure):
         moving = np.zeros(view.recorded.shape[:2], bool) if view.moving is None else view.moving
         self._views[view.index].add(view.rendered, view.recorded, moving)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> Fields:
         return {"variation": VariationScores.mean([view.result() for view in self._views.values()])}
 
 
@@ -140,7 +134,7 @@ class Motion3D(Measure):
             self._tracks = load_tracks(self._truth)
         self._last_state: FrameState | None = None
 
-    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+    def add_frame(self, frame: ComparedFrame) -> Fields:
         last_state = self._last_state
         state = frame.state
         self._last_state = state
@@ -165,7 +159,7 @@ class Motion3D(Measure):
         return {"motion_3d": evaluate_motion(old, new - old, opacities, points, views)}
 
 
-def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
+def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
     """Return the scores of a rendered image by metric and region."""
     rendered = view.rendered
     whole = valid_pixels(view.valid, rendered.shape)
@@ -177,6 +171,10 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
     scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), regions[""]))}
     if view.light is not None:
         scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
+    if view.nearest is not None:
+        image = cv2.resize(view.nearest, rendered.shape[1::-1])
+        copy, _ = unit_pair("evaluate_stream", image, view.recorded)
+        scores["psnr_nearest"] = psnr_of(mean_over(np.square(copy - b), whole))
     errors = _by_region("psnr", np.square(a - b), regions)
     scores |= {name: psnr_of(error) for name, error in errors.items()}
     scores |= _by_region("delta_e", delta_e_map(a, b), regions)

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from morgs_mi.core.checks import check_mask, valid_pixels
 from morgs_mi.core.color_space import decode_light, unit_values
-from morgs_mi.core.threads import map_in_threads
 from morgs_mi.evaluate.results import VariationScores
+from morgs_mi.platform.checks import check_mask, valid_pixels
+from morgs_mi.platform.threads import map_in_threads
 
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
 WINDOW = 11
@@ -30,6 +30,9 @@ _MU = 5000
 # Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the
 # cache.
 _ROWS = 32
+_CHANGE_WINDOW = 5
+_SIGMAS = 4
+_GREY_LEVEL = 1 / 255
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -196,11 +199,6 @@ def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | N
         )
     if mask is not None:
         check_mask(f"{name}()", mask, *shape[:2])
-
-
-_CHANGE_WINDOW = 5
-_SIGMAS = 4
-_GREY_LEVEL = 1 / 255
 
 
 class StillVariation:

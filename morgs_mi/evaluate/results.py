@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
+
+from morgs_mi.platform.bounded import JsonObject
 
 _NAN = float("nan")
 _SECONDS = (
@@ -48,6 +50,9 @@ class ViewScores(_Scores):
     #: PSNR after the gain and bias per channel that make the rendered image most like the recorded
     #: one, dB.
     psnr_matched: float = _NAN
+    #: PSNR of the recorded image of the nearest training view in place of the rendered one, dB, of
+    #: held-out views alone: what a fit has to exceed.
+    psnr_nearest: float = _NAN
     psnr_mu: float = _NAN  #: PSNR of the linear light by the mu-law, dB, of HDR recordings alone.
     ssim: float = _NAN  #: SSIM, at most 1.
     ssim_moving: float = _NAN
@@ -99,7 +104,7 @@ class FrameScores:
     motion_3d: Motion3DScores | None  #: Errors in 3D; None without tracks or a previous frame.
     views: Mapping[str, ViewScores]  #: Scores by camera name.
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the frame's row of the JSON."""
         row = asdict(self)
         scores, motion, views = map(row.pop, ("scores", "motion_3d", "views"))
@@ -141,6 +146,8 @@ class Evaluation:
     stream: str  #: Path of the stream file.
     capture: str  #: Path of the capture.
     held_out: bool  #: Whether held-out views are scored; otherwise all training views.
+    #: Quality that the fit expects of views between the cameras; empty: it is not known.
+    between_cameras: str
     complete: bool  #: Whether the stream holds all frames that were to be fitted.
     #: Frames that were fitted without any image, or have none of the evaluated views.
     without_images: tuple[int, ...]
@@ -181,7 +188,7 @@ class Evaluation:
         later_seconds = [frame.seconds for frame in self.frames[1:] if frame.seconds is not None]
         return Timings(self.frames[0].seconds, known_mean(later_seconds))
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""
         means = asdict(self.scores)
         for name in ("psnr", "ssim"):
@@ -189,9 +196,10 @@ class Evaluation:
                 getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1])
             )
             means[name] = {"mean": means[name], "first": first, "last": last}
-        names = ("stream", "capture", "held_out", "num_frames", "complete", "without_images")
+        sources = ("stream", "capture", "held_out", "between_cameras")
+        names = (*sources, "num_frames", "complete", "without_images", "regions")
         return {
-            **{name: getattr(self, name) for name in (*names, "regions")},
+            **{name: getattr(self, name) for name in names},
             **means,
             "psnr_slope": self.psnr_slope,
             "motion_3d": {} if self.motion_3d is None else asdict(self.motion_3d),

@@ -11,9 +11,12 @@ from rich.table import Table
 from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.results import Evaluation
 
-# Title, name of the score and decimals.
+# Title, name of the score and decimals. Some scores are of the whole image alone.
 _METRICS = (
     ("PSNR, dB", "psnr", 2),
+    ("PSNR, colours matched", "psnr_matched", 2),
+    ("PSNR, nearest image copied", "psnr_nearest", 2),
+    ("PSNR of the light, mu-law", "psnr_mu", 2),
     ("SSIM", "ssim", 4),
     ("dE2000", "delta_e", 2),
     ("LPIPS", "lpips", 4),
@@ -29,6 +32,7 @@ _FRAME = (
 _VIEW = (
     ("PSNR, dB", "psnr", 2),
     ("colours matched", "psnr_matched", 2),
+    ("nearest image", "psnr_nearest", 2),
     ("SSIM", "ssim", 4),
     ("flow error", "motion_error", 2),
 )
@@ -70,13 +74,9 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     table = _table(title, "", "whole", "moving", "still")
     mean = result.scores
     for title, name, digits in _METRICS:
-        values = [getattr(mean, name + region) for region in REGIONS]
-        if any(value == value for value in values):
+        values = [getattr(mean, name + region, None) for region in REGIONS]
+        if any(figure(value, 0) != "-" for value in values):
             table.add_row(title, *(figure(value, digits) for value in values))
-        if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
-            table.add_row("PSNR, colours matched", figure(mean.psnr_matched, digits), "", "")
-    if mean.psnr_mu == mean.psnr_mu:
-        table.add_row("PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", "")
     if result.variation.render == result.variation.render:
         table.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         table.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
@@ -84,7 +84,7 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
 
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
-    """Yield sentences on other views, time, size, drift and 3D motion."""
+    """Yield sentences on time, size, drift, 3D motion and, last, views that were not fitted."""
     first, last = (result.frames[k].scores.psnr for k in (0, -1))
     yield (
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
@@ -120,6 +120,14 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         f"{figure(play.fps, 0)} frames per second ({figure(play.decode_ms, 1)} ms to decode, "
         f"{figure(play.render_ms, 1)} ms to render)."
     )
+    if not result.held_out:
+        names = tuple(result.views)
+        yield (
+            f"These views were fitted; between the cameras: {result.between_cameras}; refit with "
+            f"`--hold-out {names[len(names) // 2]}` to measure."
+            if result.between_cameras
+            else "These views were fitted."
+        )
 
 
 def _table(title: str, first: str, *columns: str) -> Table:

@@ -1,1 +1,1 @@
-"""What some users need. Each folder can be deleted; it enters itself by `core.extras`."""
+"""What some users need. Each folder can be deleted; it enters itself by `platform.extras`."""

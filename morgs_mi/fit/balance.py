@@ -16,13 +16,14 @@ import numpy as np
 
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
+from morgs_mi.core.view import View
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, rendered, withheld_blocks
+from morgs_mi.fit.view import LEAST_GAIN, mean_psnr, rendered, withheld_blocks
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
+from morgs_mi.platform.progress import Progress
 
 # Fits that are compared: to the images as recorded and to the balanced ones.
 _COMPARED = 2
@@ -99,15 +100,16 @@ def balance_cameras(
     short_config = short_fit_config(config)
     steps = short_config.planned_steps
     count = 0
+    report(0, how.rounds + _COMPARED)
 
     def fitted(start: Gaussians, exposures: Sequence[Exposure], steps: int) -> Gaussians:
         """Return Gaussians after some steps, from a start, in the colours of the scene."""
         nonlocal count
         fit_problem = replace(problem, start=start, views=tuple(_corrected(visible, exposures)))
         fit_config = replace(short_config, first_frame_steps=steps)
-        result = fit_first_frame(fit_problem, fit_config, rng_of(seed, Stream.BALANCE))
+        part = report.part(count, how.rounds + _COMPARED)
+        result = fit_first_frame(fit_problem, fit_config, rng_of(seed, Stream.BALANCE), part)
         count += 1
-        report(count, how.rounds + _COMPARED)
         return result.gaussians
 
     as_recorded = (Exposure(),) * len(problem.views)
@@ -120,8 +122,12 @@ def balance_cameras(
         # Relative to the Gaussians, without what most cameras have in common.
         exposures = centred(
             [
-                fit_exposure(rendered(gaussians, camera, problem.render), unit_values(image), mask)
-                for camera, image, mask in visible
+                fit_exposure(
+                    rendered(gaussians, view.camera, problem.render),
+                    unit_values(view.image),
+                    view.mask,
+                )
+                for view in visible
             ]
         )
         largest = max(exposure.change for exposure in exposures)
@@ -142,4 +148,4 @@ def balance_cameras(
 def _corrected(views: Sequence[View], exposures: Sequence[Exposure]) -> list[View]:
     """Return views with images in the colours of the scene, by their exposures."""
     pairs = zip(views, exposures, strict=True)
-    return [view._replace(image=exposure.corrected(view.image)) for view, exposure in pairs]
+    return [replace(view, image=exposure.corrected(view.image)) for view, exposure in pairs]

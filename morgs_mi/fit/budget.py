@@ -25,12 +25,13 @@ import numpy as np
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.memory import check_memory
 from morgs_mi.core.rig import mean_views
+from morgs_mi.core.view import View
 from morgs_mi.fit.detail import count_details
 from morgs_mi.fit.first_frame import LAST_ROUND
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import View, half_sized
+from morgs_mi.fit.view import half_sized
+from morgs_mi.platform.memory import check_memory
 
 # Seconds of a first frame without a limit, on the reference machine.
 _SECONDS = 120.0

@@ -27,7 +27,17 @@ from annotated_types import Ge, Le
 from drjit.opt import Adam
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import (
+from morgs_mi.core.color_space import BRIGHTEST, unit_values
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import scene_extent
+from morgs_mi.core.types import Arrays
+from morgs_mi.fit.fit_config import DensityConfig
+from morgs_mi.fit.initialise import in_empty_space
+from morgs_mi.fit.optimise import select_rows, values_of
+from morgs_mi.method.error_per_gaussian import densification_scores
+from morgs_mi.method.observed_view import ObservedView
+from morgs_mi.method.ssim import Target
+from morgs_mi.platform.checks import (
     LARGEST,
     check_mask,
     check_number,
@@ -37,16 +47,7 @@ from morgs_mi.core.checks import (
     numbers,
     require,
 )
-from morgs_mi.core.color_space import BRIGHTEST, unit_values
-from morgs_mi.core.config import check_value, config_or_default
-from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import scene_extent
-from morgs_mi.core.types import Arrays
-from morgs_mi.fit.fit_config import DensityConfig
-from morgs_mi.fit.initialise import in_empty_space
-from morgs_mi.fit.optimise import select_rows, values_of
-from morgs_mi.method.error_per_gaussian import densification_scores
-from morgs_mi.method.ssim import Target
+from morgs_mi.platform.config import check_value, config_or_default
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.render_config import RenderConfig
 
@@ -182,7 +183,7 @@ class DensityControl:
     Attributes:
         extent: of the scene, world units.
         scores: densification scores [N] since the last step, by which parents are chosen; may be
-            set, such as to gradients of projected means (`means2d` of `rasterize`). None: none yet.
+            set, such as to gradients of projected means (see `render_view`). None: none yet.
 
     Raises:
         ValueError: neither cameras nor an extent are given, or an argument is of another type or
@@ -246,13 +247,11 @@ class DensityControl:
         if mask is not None:
             check_mask(place, mask, height, width)
         gaussians = Gaussians.from_parameters(values_of(optimizer))
-        self.observe_views(gaussians, [view], [Target(image, mask)])
+        self.observe_views(gaussians, [ObservedView.of(view, Target(image, mask))])
 
-    def observe_views(
-        self, gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]
-    ) -> None:
+    def observe_views(self, gaussians: Gaussians, views: Sequence[ObservedView]) -> None:
         """Render views and attribute their errors to N Gaussians, see `densification_scores`."""
-        scores = densification_scores(gaussians, views, targets)
+        scores = densification_scores(gaussians, views)
         self.scores = scores if self.scores is None else np.maximum(self.scores, scores)
 
     def step(self, optimizer: Adam, births: int) -> DensityPlan:

@@ -22,8 +22,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import unit_values
+from morgs_mi.platform.checks import valid_pixels
 
 # A value of a block follows from its mean and the other three.
 _INDEPENDENT = 3 / 4

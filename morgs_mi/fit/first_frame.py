@@ -15,7 +15,7 @@ noise and the angles between them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -24,16 +24,17 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from morgs_mi.core.attributes import ATTRIBUTES, sigmoid
+from morgs_mi.core.arrays import from_numpy, opaque
+from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensors
+from morgs_mi.core.view import View
 from morgs_mi.fit.density import DensityControl
 from morgs_mi.fit.detail import is_noisy
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.forecast import forecast
+from morgs_mi.fit.forecast import MANY_VIEWS, are_far_apart
+from morgs_mi.fit.frozen_views import FirstSteps, is_recordable, kept, with_dropout
 from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.optimise import (
     Steps,
@@ -46,22 +47,16 @@ from morgs_mi.fit.optimise import (
     view_order,
 )
 from morgs_mi.fit.view import half_sized
-from morgs_mi.method.objective import SQUARED_ERROR, mask_loss, recon_loss
+from morgs_mi.method.objective import SQUARED_ERROR, ObjectiveConfig, mask_loss, recon_loss
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.ssim import Target
+from morgs_mi.platform.progress import Progress
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.render_config import RenderConfig
 
-# Number of views that are fitted without dropout.
-_MANY_VIEWS = 6
-# Logit of an opacity that no cut-off of the renderer lets pass.
-_INVISIBLE = -30.0
-# Largest opacity, which has a finite logit.
-_MOST = 0.999
 # Probability with which few views are fitted that are noisy or far apart.
 _DROPOUT = 0.2
-# Least `Forecast.reach` of views that are far apart, degrees.
-_FAR = 24.0
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -74,12 +69,7 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
     """
     if not probability:
         return gaussians
-    is_kept = from_numpy(mi.UInt32, rng.random(len(gaussians), np.float32) >= probability) != 0
-    opacity = dr.minimum(
-        sigmoid(gaussians.logit_opacities.array) * dr.opaque(mi.Float, 1 / (1 - probability)), _MOST
-    )
-    logits = dr.select(is_kept, dr.log(opacity) - dr.log(1 - opacity), _INVISIBLE)
-    return replace(gaussians, logit_opacities=mi.TensorXf(logits))
+    return with_dropout(gaussians, probability, kept(len(gaussians), probability, rng))
 
 
 def adapted_to_images(config: FitConfig, problem: FirstFrameProblem) -> FitConfig:
@@ -94,9 +84,8 @@ def adapted_to_images(config: FitConfig, problem: FirstFrameProblem) -> FitConfi
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
     if config.dropout is not None:
         return config
-    views = len(problem.views)
-    few = views < _MANY_VIEWS
-    far = few and views > 1 and forecast(problem.cameras, problem.points).reach >= _FAR
+    few = len(problem.views) < MANY_VIEWS
+    far = are_far_apart(problem.cameras, problem.points)
     return replace(config, dropout=_DROPOUT if few and (noisy or far) else 0.0)
 
 
@@ -111,8 +100,6 @@ LAST_ROUND = 0.5
 """Last round of density control, as a fraction of the steps: the remaining steps fit the births."""
 # Learning rates at the end, as a fraction of those at the start.
 _FINAL_RATE = 0.1
-
-
 # Steps after which the clock is read, under a limit.
 _CHECKED = 20
 # Least number of steps under a limit.
@@ -126,13 +113,32 @@ class _Pace:
     clock.
     """
 
-    def __init__(self, steps: int, limit: float | None) -> None:
+    def __init__(self, steps: int, limit: float | None, late: float) -> None:
         self._steps = steps
         self._limit = limit
+        self._late = late
         self._begin = self._checked = time.perf_counter()
         self._stride = 1.0
         self.position = 0.0  # planned steps that are done
         self.count = 0  # steps that were made
+
+    def done(self) -> tuple[float, float]:
+        """Return how much is done, and of how much: seconds of the limit, or without one planned
+        steps, in proportion to the time they take.
+        """
+        position = min(self.position + 1, self._steps)
+        share = self._work(position) / self._work(self._steps)
+        if self._limit is None:
+            return self._steps * share, self._steps
+        seconds = time.perf_counter() - self._begin
+        # The least number of steps may take longer.
+        return seconds, self._limit if seconds < self._limit else seconds / share
+
+    def _work(self, position: float) -> float:
+        """Return the time that the planned steps up to a position take, in units of a step with the
+        half-sized images.
+        """
+        return position + (self._late - 1) * max(position - LAST_ROUND * self._steps, 0)
 
     def views(self, order: Iterator[int], stop: int) -> Iterator[int]:
         """Yield the view of each step before the planned step `stop`."""
@@ -145,12 +151,10 @@ class _Pace:
                 moment = time.perf_counter()
                 seconds = (moment - self._checked) / _CHECKED
                 self._checked = moment
-                late = self._steps - max(self.position, LAST_ROUND * self._steps)
-                early = max(LAST_ROUND * self._steps - self.position, 0)
-                if early:
-                    late *= _LATE
+                work = self._work(self._steps) - self._work(self.position)
+                steps_left = work / (self._work(self.position) - self._work(self.position - 1))
                 left = max(self._begin + self._limit - moment, 1e-3)
-                stride = min((early + late) * seconds / left, self._steps / _LEAST_STEPS)
+                stride = min(steps_left * seconds / left, self._steps / _LEAST_STEPS)
                 self._stride = max(stride, 1.0)
 
 
@@ -184,7 +188,8 @@ def fit_first_frame(
         problem: views and initial Gaussians.
         config: steps and rates.
         rng: draws the views and the means of births.
-        progress: called with the numbers of steps made and of all steps.
+        progress: called with the numbers of steps made and of all steps, in proportion to their
+            time; with a limit, in seconds.
         on_round: called with the Gaussians before each round of density control.
         limit: of the time, seconds, for which steps are skipped; None: none.
     """
@@ -199,21 +204,27 @@ def fit_first_frame(
     # The higher bands follow.
     optimizer = adam({name: parameters[name] for name in names if name != "sh_rest"})
     rates = config.first_frame_rates.by_parameter(problem.extent)
-    fit_views = half_sized(problem.views) if rounds else problem.views
-    views = [ActiveView(view.camera, problem.render) for view in fit_views]
-    targets = [Target(view.image, view.mask) for view in fit_views]
+    views = _observed(half_sized(problem.views) if rounds else problem.views, problem.render)
 
     def losses_at(parameters: Tensors, view: int) -> Tensors:
         gaussians = dropped(start.with_parameters(parameters), config.dropout or 0.0, rng)
-        image = views[view].render(gaussians)
-        target = targets[view]
+        image = render_view(gaussians, views[view])
+        target = views[view].target
         loss = recon_loss(image.color, target, config.objective.dssim_weight)
         return {"recon": loss, SQUARED_ERROR: target.mse}
 
+    def record() -> FirstSteps | None:
+        """Return the steps in the views as recordings; None where they cannot be recorded."""
+        if not is_recordable(views, ObjectiveConfig()):
+            return None
+        weight = config.objective.dssim_weight
+        return FirstSteps(views, weight, config.dropout or 0.0, rng)
+
+    steps_of_views = record()
     control = DensityControl(problem.cameras, config.density, problem.extent, rng)
     losses = {}
     order = iter(view_order(len(views), steps, rng))
-    pace = _Pace(steps, limit)
+    pace = _Pace(steps, limit, _LATE if rounds else 1.0)
 
     for first, stop in pairwise(sorted({0, *bands, *rounds, steps})):
         if on_round is not None and first in rounds:
@@ -222,27 +233,37 @@ def fit_first_frame(
             _add_band(optimizer, start)
         if first in rounds:
             if first == rounds[-1]:  # its scores come from the full images already
-                views = [ActiveView(camera, problem.render) for camera in problem.cameras]
-                targets = [Target(view.image, view.mask) for view in problem.views]
+                views = _observed(problem.views, problem.render)
+                steps_of_views = record()
             gaussians = start.with_parameters(values_of(optimizer))
             missing = max(config.planned_gaussians - len(gaussians), 0)
-            control.observe_views(gaussians, views, targets)
+            control.observe_views(gaussians, views)
             del gaussians  # tensors that the next steps would keep in memory
             births = -(-missing // (len(rounds) - rounds.index(first)))
             start = start.select(control.step(optimizer, births).parent)
         chunk = Steps(
             pace.views(order, stop),
             rate_factor=lambda _: _FINAL_RATE ** (pace.position / steps),
-            on_step=lambda _: progress(min(pace.position + 1, steps), steps),
+            on_step=lambda _: progress(*pace.done()),
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )
-        losses = optimise(optimizer, rates, losses_at, chunk)
+        recorded_steps = steps_of_views.of(len(start)) if steps_of_views is not None else None
+        losses = optimise(optimizer, rates, losses_at, chunk, recorded_steps=recorded_steps)
     if pace.count < steps:  # perhaps the last ones were skipped
-        progress(steps, steps)
+        total = pace.done()[1]
+        progress(total, total)
     psnr = pop_psnr(losses)
-    problem_text = fit_problem(psnr, (target.constant_error() for target in targets))
+    problem_text = fit_problem(psnr, (view.target.constant_error() for view in views))
     gaussians = start.with_parameters(values_of(optimizer))
     return FirstFrame(gaussians, losses, pace.count, psnr, problem_text)
+
+
+def _observed(views: Sequence[View], render: RenderConfig) -> list[ObservedView]:
+    """Return whole views as they are rendered and compared."""
+    return [
+        ObservedView.of(ActiveView(view.camera, render), Target(view.image, view.mask))
+        for view in views
+    ]
 
 
 def density_rounds(config: FitConfig) -> list[int]:
@@ -260,11 +281,14 @@ def _add_band(optimizer: Adam, base: Gaussians) -> None:
     coefficients = np.asarray(dr.detach(optimizer["sh_rest"]))
     next_degree = round((coefficients.shape[1] + 1) ** 0.5)
     width = (next_degree + 1) ** 2 - 1
+    new_coefficients = rest[:, coefficients.shape[1] : width]
     replace_parameter(
         optimizer,
         "sh_rest",
-        np.concatenate([coefficients, rest[:, coefficients.shape[1] : width]], axis=1),
-        lambda moment: np.pad(moment, [(0, 0), (0, width - coefficients.shape[1]), (0, 0)]),
+        from_numpy(mi.TensorXf, np.concatenate([coefficients, new_coefficients], axis=1)),
+        lambda m: from_numpy(
+            mi.TensorXf, np.pad(m, [(0, 0), (0, new_coefficients.shape[1]), (0, 0)])
+        ),
     )
 
 
@@ -290,19 +314,18 @@ def fit_confidence(
     Returns:
         The Gaussians with the learned confidence, and the losses by name.
     """
-    views = sorted(masks)
+    views = {view: ActiveView(cameras[view], render) for view in sorted(masks)}
     targets = {view: from_numpy(mi.TensorXf, masks[view]) for view in views}
 
     def losses_at(parameters: Tensors, view: int) -> Tensors:
         trial = replace(gaussians, logit_confidence=parameters["logit_confidence"])
-        image = rasterize(
-            trial, cameras[view], ("confidence",), detach_weights=("confidence",), config=render
-        )
-        num_pixels = cameras[view].width * cameras[view].height
-        return {"mask": mask_loss(image.confidence, targets[view], num_pixels)}
+        image = render_view(trial, views[view], ("confidence",), detach_weights=("confidence",))
+        pixel_share = opaque(mi.Float, 1 / (cameras[view].width * cameras[view].height))
+        return {"mask": mask_loss(image.confidence, targets[view], pixel_share)}
 
     rates = {"logit_confidence": config.first_frame_rates.confidence}
-    order = [views[k] for k in view_order(len(views), config.confidence_steps, rng)]
+    indices = [*views]
+    order = [indices[k] for k in view_order(len(views), config.confidence_steps, rng)]
     optimizer = adam({"logit_confidence": gaussians.logit_confidence})
     losses = optimise(optimizer, rates, losses_at, Steps(order))
     return replace(gaussians, **values_of(optimizer)), losses

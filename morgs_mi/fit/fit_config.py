@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, Lt
 
 from morgs_mi.core.attributes import ATTRIBUTES
-from morgs_mi.core.config import Count, NonNegative, NonNegativeInt, Positive, config_class
 from morgs_mi.method.objective import ObjectiveConfig
+from morgs_mi.platform.config import Count, NonNegative, NonNegativeInt, Positive, config_class
 
 # Epochs of a later frame before the learning rate of the means begins to decay.
 _CONSTANT_EPOCHS = 2
@@ -170,14 +170,9 @@ class FitConfig:
     confidence_steps: NonNegativeInt = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
     epochs: Count = 8
-    """Most passes over all training views for every later frame; the paper's small variant takes 5.
-    """
+    """Passes over all training views for every later frame; the paper's small variant takes 5."""
     skip_static: bool = True
     """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`).
-    """
-    early_stopping_tolerance: NonNegative = 1e-6
-    """Relative decrease of the objective over two epochs below which a later frame ends early; 0:
-    never.
     """
     objective: ObjectiveConfig = ObjectiveConfig()
     """Weights of the losses."""

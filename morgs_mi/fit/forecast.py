@@ -19,6 +19,10 @@ from morgs_mi.core.rig import (
     surface_of,
 )
 
+MANY_VIEWS = 6
+"""Number of cameras from which they are not few."""
+# Least `Forecast.reach` of cameras that are far apart, degrees.
+_FAR = 24.0
 # Largest `Forecast.reach` of good and of fair views between the cameras, degrees
 # (`docs/experiments/first-frame.md`).
 _GOOD = 9.5
@@ -55,11 +59,35 @@ class Forecast:
             return sentence
         if self.spacing <= _GOOD:
             return f"{sentence} They would be good if neighbours shared more."
-        more = ceil((self.cameras - 1) * (self.spacing / _GOOD - 1))
         return (
-            f"{sentence} Cameras at most {int(_GOOD)} degrees apart would make them good: {more} "
-            "more on an arc."
+            f"{sentence} Cameras at most {int(_GOOD)} degrees apart would make them good: "
+            f"{self._more} more on an arc."
         )
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the angles between the cameras alone make such views poor."""
+        return self.spacing > _FAIR
+
+    @property
+    def unmatched_sentence(self) -> str:
+        """The quality of a rig whose images do not match because it is wide."""
+        return (
+            f"{self.cameras} cameras, {self.spacing:.0f} degrees apart, are too far from each "
+            "other to match their images: poses are not checked, and views between the cameras "
+            f"will be {self.quality}; with {self._more} more on an arc, at most {int(_GOOD)} "
+            "degrees apart, they would be good."
+        )
+
+    @property
+    def _more(self) -> int:
+        """Number of further cameras that would make views good."""
+        return ceil((self.cameras - 1) * (self.spacing / _GOOD - 1))
+
+
+def are_far_apart(cameras: Sequence[Camera], points: np.ndarray) -> bool:
+    """Return whether cameras are few and far apart; `points` as for `forecast`."""
+    return 1 < len(cameras) < MANY_VIEWS and forecast(cameras, points).reach >= _FAR
 
 
 def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:

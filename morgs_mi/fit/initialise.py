@@ -9,30 +9,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, in_image, scene_depths, scene_extent, seen_points
+from morgs_mi.core.view import View
+from morgs_mi.fit.far_views import Points, are_around, far_points
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import View
+from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.render.render_config import RenderConfig
 
-Points = tuple[np.ndarray, np.ndarray]
-"""Points [P, 3] in world units, and their encoded colours [P, 3], of which 1 is white."""
 MIN_POINTS = 20
 """Number of points below which Gaussians start from random ones."""
-# Number of points below which random ones are added where views show none.
-_MANY_POINTS = 1000
+MANY_POINTS = 1000
+"""Number of points below which random ones are added where views show none."""
 # Share of the points that the cameras see, at least, and the number of points that are checked.
 _LEAST_SEEN = 0.05
 _CHECKED = 10_000
 # Rows and columns into which a view is divided to find where it shows no points.
 _CELLS = 8
+# Random depths of a random point, of which one is chosen.
+_DEPTHS = 64
+# Largest difference of the colours of one point in two views, and of two pixels of one background.
+_SAME_POINT = 0.08
+_SAME_BACKGROUND = 2 / 255
+# Least share of the border pixels that show the background, and of the pixels if it is plain.
+_BORDER = 0.25
 # Distance of random points from cameras with parallel axes, scene extents.
 _PARALLEL = 10.0
 # Points in a view that a random one gets its depth from.
@@ -81,28 +88,35 @@ def from_points(
 
 
 def initial_points(
-    views: Sequence[View], points: Points, count: int, rng: np.random.Generator
+    views: Sequence[View],
+    points: Points,
+    count: int,
+    rng: np.random.Generator,
+    background: Sequence[float] | None = None,
 ) -> Points:
     """Return the points that Gaussians start from, at most [count, 3], and their colours.
 
-    Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there
-    are few, random ones are added where the views show none. Points in the empty space before the
-    cameras are left out. Given points get the colours of HDR views, because their own do not exceed
-    white.
+    Fewer than `MIN_POINTS` given ones are replaced by random points inside the views, or by
+    `far_points` where few cameras stand far apart around a room; where there are few, random ones
+    are added where the views show none. Points in the empty space before the cameras are left out.
+    Given points get the colours of HDR views, because their own do not exceed white.
 
     Args:
         views: V views, at least one.
         points: P points and their colours.
         count: number of points; those in the empty space are not replaced.
         rng: draws points.
+        background: encoded colour [3] behind all Gaussians; None: no pixel shows it.
     """
     points = _in_light(points, views)
     num_points = len(points[0])
-    if num_points < MIN_POINTS:
-        points = seed_points(views, count, rng)
-    elif num_points < _MANY_POINTS:
-        points = fill_points(points, views, count, rng)
     cameras = [view.camera for view in views]
+    if num_points < MANY_POINTS and are_around(cameras) and _fills(views, background):
+        points = _concatenated([points, far_points(views, max(count - num_points, 1), rng)])
+    elif num_points < MIN_POINTS:
+        points = seed_points(views, count, rng, background)
+    elif num_points < MANY_POINTS:
+        points = fill_points(points, views, count, rng)
     for is_resampled in (False, True):
         points = resample_points(points, count, rng) if is_resampled else points
         # Also afterwards: points between two others may lie there.
@@ -110,6 +124,13 @@ def initial_points(
         if not is_empty.all():
             points = points[0][~is_empty], points[1][~is_empty]
     return points
+
+
+def has_points(cameras: Sequence[Camera], points: np.ndarray) -> bool:
+    """Return whether Gaussians can start from the points [P, 3]: there are enough, and cameras see
+    them.
+    """
+    return len(points) >= MIN_POINTS and not unseen_points(cameras, points)
 
 
 def unseen_points(cameras: Sequence[Camera], points: np.ndarray) -> str:
@@ -189,40 +210,121 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
     return new_positions, new_colors
 
 
-def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
+def seed_points(
+    views: Sequence[View],
+    count: int,
+    rng: np.random.Generator,
+    background: Sequence[float] | None = None,
+) -> Points:
     """Return random points [count, 3] inside the views, and their colours [count, 3].
 
-    Each view with valid pixels gets the same number of points: random ones of these pixels at
-    random depths, uniform in 1 / depth between a third and three times the distance of the
-    `focus_point`, in their colours. Where the focus point is not in front of the camera, as with
-    parallel axes, the distance is ten scene extents.
+    Each view with valid pixels gets the same number of points, in the colours of random pixels that
+    do not show the background. Of 64 random depths, a point gets the one at which most views show
+    its colour: the frustums overlap there, and no view sees something else through it. The depths
+    are uniform in 1 / depth between a third and three times the distance of the
+    `focus_point`. Where the focus point is not in front of the camera, as with parallel axes, the
+    distance is ten scene extents.
 
     Args:
         views: V views.
         count: number of points.
         rng: draws pixels and depths.
+        background: encoded colour [3] behind all Gaussians; None: no pixel shows it.
     """
     cameras = [view.camera for view in views]
-    depths = focus_depths(cameras)
-    depths[np.isinf(depths)] = _PARALLEL * scene_extent(cameras)
-    pairs = [
-        (view, depth)
-        for view, depth in zip(views, depths, strict=True)
-        if view.mask is None or view.mask.any()
+    distances = focus_depths(cameras)
+    distances[np.isinf(distances)] = _PARALLEL * scene_extent(cameras)
+    blurred = [np.asarray(cv2.blur(view.image, (3, 3))) for view in views]
+    masks = [_shows_scene(view, background) for view in views]
+    sources = [
+        (view, distance, mask)
+        for view, distance, mask in zip(views, distances, masks, strict=True)
+        if mask.any()
     ]
     parts = [(np.zeros((0, 3)), np.zeros((0, 3)))]
-    shares = np.array_split(np.arange(count), max(len(pairs), 1))
-    for (view, depth), share in zip(pairs, shares, strict=False):
-        camera, image, mask = view
-        distance = max(depth, 10 * camera.near)
-        rows, columns = np.nonzero(valid_pixels(mask, image.shape))
-        pixels = rng.integers(0, len(rows), len(share))
-        rows = rows[pixels]
-        columns = columns[pixels]
+    shares = np.array_split(np.arange(count), max(len(sources), 1))
+    for (view, distance, mask), share in zip(sources, shares, strict=False):
+        rows, columns = np.nonzero(mask)
+        chosen = rng.integers(0, len(rows), len(share))
+        rows = rows[chosen]
+        columns = columns[chosen]
+        colors = unit_values(view.image[rows, columns])
         within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (len(share), 2))
-        points = camera.unproject(within, distance / rng.uniform(1 / 3, 3, len(share)))
-        parts.append((points, unit_values(image[rows, columns])))
+        depths = max(distance, 10 * view.camera.near) / rng.uniform(1 / 3, 3, (_DEPTHS, len(share)))
+        points = view.camera.unproject(np.tile(within, (_DEPTHS, 1)), depths.ravel())
+        counts = _agreeing_views(points, np.tile(colors, (_DEPTHS, 1)), cameras, blurred)
+        best = counts.reshape(depths.shape).argmax(axis=0)
+        parts.append((points.reshape(*depths.shape, 3)[best, np.arange(len(share))], colors))
     return _concatenated(parts)
+
+
+def _agreeing_views(
+    points: np.ndarray,
+    colors: np.ndarray,
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Return the number of views that show each of the points [P, 3] in its colour [P]."""
+    counts = np.zeros(len(points), int)
+    for camera, image in zip(cameras, images, strict=True):
+        visible, pixels, _ = seen_points(camera, points)
+        columns, rows = pixels.astype(int).T
+        error = np.abs(unit_values(image[rows, columns]) - colors[visible]).max(axis=1)
+        counts[visible] += error < _SAME_POINT
+    return counts
+
+
+def _shows_scene(view: View, background: Sequence[float] | None) -> np.ndarray:
+    """Return the valid pixels [H, W] that do not show the background; all valid ones where none
+    is left.
+    """
+    is_valid = valid_pixels(view.mask, view.image.shape)
+    if background is None:
+        return is_valid
+    shows_scene = is_valid & ~_is_alike(unit_values(view.image), background)
+    return shows_scene if shows_scene.any() else is_valid
+
+
+def _fills(views: Sequence[View], background: Sequence[float] | None) -> bool:
+    """Return whether few pixels of the views show the background."""
+    num_shown = sum(_shows_scene(view, background).sum() for view in views)
+    num_valid = sum(valid_pixels(view.mask, view.image.shape).sum() for view in views)
+    return num_shown > (1 - _BORDER) * num_valid
+
+
+def _is_alike(colors: np.ndarray, background: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return which of the colours [..., 3] are the background's [...]."""
+    return np.abs(colors - np.asarray(background)).max(axis=-1) <= _SAME_BACKGROUND
+
+
+def border_color(views: Sequence[View]) -> tuple[float, float, float] | None:
+    """Return the encoded colour of the border pixels of the views, None where they have no colour
+    in common.
+    """
+    parts = []
+    for view in views:
+        is_border = valid_pixels(view.mask, view.image.shape).copy()
+        is_border[1:-1, 1:-1] = False
+        parts.append(unit_values(view.image[is_border]))
+    pixels = np.concatenate(parts)
+    if not len(pixels):
+        return None
+    colors, counts = np.unique(np.round(255 * pixels), axis=0, return_counts=True)
+    is_background = _is_alike(pixels, colors[counts.argmax()] / 255)
+    if is_background.mean() < _BORDER:
+        return None
+    red, green, blue = np.median(pixels[is_background], axis=0).tolist()
+    return red, green, blue
+
+
+def mean_color(views: Sequence[View]) -> tuple[float, float, float]:
+    """Return the mean encoded colour of the valid pixels of the views."""
+    means = []
+    for view in views:
+        pixels = view.image[valid_pixels(view.mask, view.image.shape)]
+        means.append(unit_values(pixels).mean(axis=0))
+    red, green, blue = np.mean(means, axis=0).tolist()
+    return red, green, blue
 
 
 def _concatenated(parts: Sequence[Points]) -> Points:
@@ -311,7 +413,7 @@ class FirstFrameProblem:
             render: cut-offs.
             rng: draws points.
         """
-        start_points = initial_points(views, points, config.first_count, rng)
+        start_points = initial_points(views, points, config.first_count, rng, render.background)
         start = from_points(*start_points, config.sh_degree, _OPACITY)
         cameras = [view.camera for view in views]
         extent = max(

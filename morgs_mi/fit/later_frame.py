@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.gaussians import Gaussians, at_rest, displaced
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.progress import Progress
-from morgs_mi.core.types import Arrays, Tensors
+from morgs_mi.core.types import Tensors
 from morgs_mi.fit.density import DensityControl, apply_plan
 from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.frozen_views import LaterSteps, is_recordable
 from morgs_mi.fit.optimise import (
     Steps,
     adam,
@@ -31,21 +32,21 @@ from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.objective import (
     SQUARED_ERROR,
+    Observations,
     Prediction,
     channels_of,
     losses_of,
     recon_loss,
-    terms_of,
     weights_of,
 )
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.residual import apply_residual, residual_parameters
-from morgs_mi.method.rigidity import Neighbours, find_neighbours
-from morgs_mi.method.ssim import Target
+from morgs_mi.platform.progress import Progress
+from morgs_mi.render.rasterize import check_rendering, render_view
 
-# Fraction of the epochs after which the round of density control is due, even if the loss still
-# falls: the residual has shown by then where Gaussians are missing, and enough steps are left to
-# fit the births.
-_LATEST_DENSITY_ROUND = 0.625
+# Fraction of the epochs after which the round of density control is due: the residual has shown by
+# then where Gaussians are missing, and enough steps are left to fit the births.
+_DENSITY_ROUND = 0.625
 # Learning rates of a motion model at the end, as a fraction of those at the start.
 _FINAL_RATE = 0.1
 
@@ -55,10 +56,8 @@ class FrameProblem:
     """Input of the fit of a later frame."""
 
     previous: Gaussians  #: N Gaussians of the previous frame, detached.
-    active: ActiveSet  #: The active Gaussians and views.
-    targets: Mapping[int, Target]  #: Images of the active views, by view index.
-    #: Observations of the key views: arrays [H, W, ...] by name, by view index.
-    observations: Mapping[int, Arrays]
+    active: ActiveSet  #: The active Gaussians.
+    views: Mapping[int, ObservedView]  #: The active views with their images, by view index.
     #: Start of the motion, confidence, colour and rotation of the A active Gaussians; None: no
     #: motion, and all else as before.
     start: MotionStart | None
@@ -76,7 +75,7 @@ class LaterFrame:
     #: last.
     source: np.ndarray
     losses: dict[str, float]  #: Mean losses of the last epoch, by the names of the terms.
-    epochs: int  #: Number of epochs that were run.
+    steps: int  #: Number of steps, one in every active view per epoch.
     #: Of the active views in the last epoch, in the pixels that were fitted, dB; NaN without one.
     psnr: float
     problem: str  #: A sentence if that is worse than a constant image; empty otherwise.
@@ -100,28 +99,27 @@ def fit_later_frame(
         progress: called with the numbers of steps made and of all steps.
     """
     active = problem.active
-    views = sorted(active.views)
+    views = problem.views
     count = len(views)
     if not count or not len(active.indices):
         source = np.arange(len(problem.previous))
         return LaterFrame(at_rest(problem.previous), source, {}, 0, np.nan, "")
     progress = progress or Progress()
     objective = config.objective
-    order = [views[k] for k in view_order(count, config.epochs * count, rng)]
-    # As tensors on the region of each active view.
-    observations = {
-        v: {"target": problem.targets[v]}
-        | {
-            name: from_numpy(mi.TensorXf, view.crop(array))
-            for name, array in problem.observations.get(v, {}).items()
-        }
-        for v, view in active.views.items()
-    }
+    indices = sorted(views)
+    order = [indices[k] for k in view_order(count, config.epochs * count, rng)]
+
+    @cache
+    def observed_in(index: int) -> Observations:
+        """Return what a view is compared with, as tensors on its region."""
+        view = views[index]
+        images = view.observed.items()
+        tensors = {name: from_numpy(mi.TensorXf, view.crop(array)) for name, array in images}
+        return {"target": view.target, **tensors}
+
     previous = active.select(problem.previous)
     source = np.arange(len(active.indices))
-    scores: ErrorPerGaussian | None = None  # of the last epoch; None: no density control is to come
-    shared: dict[str, Neighbours] = {}  # observations of all views
-    awaits_density_round = config.density.later_frames
+    scores: ErrorPerGaussian | None = None  # None: the epoch collects none
 
     def steps_of(epoch: int, epochs: int = 1) -> Steps:
         """Return the steps of some epochs, one in every active view per epoch."""
@@ -140,56 +138,52 @@ def fit_later_frame(
 
     def losses_at(parameters: Tensors, index: int) -> Tensors:
         """Render one view and return its losses by name."""
-        view = active.views[index]
-        observed = {**observations[index], **shared}
+        view = views[index]
+        observed = observed_in(index)
         channels = channels_of(observed, objective)
         gaussians = apply_residual(previous, parameters, motion)
         features = None if scores is None else scores.features()
         # Motion, confidence and scores must not move opacity and geometry.
         names = channels if features is None else (*channels, "features")
         detached_channels = [name for name in names if name != "color"]
-        image = view.render(gaussians, channels, detached_channels, features)
+        image = render_view(
+            gaussians, view, channels, features=features, detach_weights=detached_channels
+        )
         if scores is not None and features is not None:
-            scores.observe(image, problem.targets[index], view.region)
+            scores.observe(image, view.target, view.region)
         prediction = Prediction(
             image,
             parameters,
             view.region,
-            view.camera.width * view.camera.height,
-            active.num_gaussians,
+            opaque(mi.Float, 1 / (view.camera.width * view.camera.height)),
+            opaque(mi.Float, 1 / (active.num_gaussians * problem.extent)),
             problem.extent,
             gaussians,
+            previous,
         )
         losses = losses_of(prediction, observed, objective)
-        return {**losses, SQUARED_ERROR: problem.targets[index].mse}
+        return {**losses, SQUARED_ERROR: view.target.mse}
 
     start = problem.start
     losses = dict[str, float]()
-    epochs = 0
+    model_epochs = 0
     psnr = np.nan
     factory = MOTION_MODELS.make(motion.model, motion)
     if factory is not None:
-        epochs = max(1, round(motion.model_share * config.epochs))
+        model_epochs = max(1, round(motion.model_share * config.epochs))
         model = factory(previous, problem.extent, rng)
-        steps = steps_of(0, epochs)
+        steps = steps_of(0, model_epochs)
         start, losses = _fit_motion(previous, problem, model, start, steps, objective.dssim_weight)
     optimizer = adam(residual_parameters(previous, motion, start), config.momentum)
     weights = weights_of(objective)
-    has_neighbours = any(
-        "neighbours" in term.observations for term in terms_of(objective) if weights[term.name]
-    )
-    latest_density_epoch = round(_LATEST_DENSITY_ROUND * config.epochs)
-    tolerance = config.early_stopping_tolerance
-    objectives = []
-    while epochs < config.epochs:
-        # It may rise in a single epoch.
-        has_converged = (
-            tolerance > 0
-            and len(objectives) > 2
-            and objectives[-1] > (1 - tolerance) * objectives[-3]
-        )
-        # An epoch has shown where to add Gaussians.
-        if scores is not None and (has_converged or epochs >= latest_density_epoch):
+    later_steps = None
+    if is_recordable(views.values(), objective):
+        later_steps = LaterSteps(views, optimizer, objective, motion)
+    recorded_steps = None
+    # The round comes after an epoch of the residual, which shows where to add Gaussians.
+    density_epoch = max(round(_DENSITY_ROUND * config.epochs), model_epochs + 1)
+    for epoch in range(model_epochs, config.epochs):
+        if scores is not None:
             num_static = len(problem.previous) - len(active.indices)
             control = DensityControl((), config.density, problem.extent, rng)
             control.scores = np.asarray(scores.scores)
@@ -198,25 +192,24 @@ def fit_later_frame(
             # starts from the past of its parent, and shares its residual.
             previous = apply_plan(previous, plan)
             source = plan.source
-            shared = {}
+            recorded_steps = None
             scores = None
-            awaits_density_round = False
-        elif has_converged:
-            break
-        if awaits_density_round:
+        elif config.density.later_frames and epoch == density_epoch - 1:
             # Scores are collected in the last quarter: an error that is seen earlier may be gone by
             # the end of the epoch.
             scores = ErrorPerGaussian(len(source), count - (count + 3) // 4)
-        if has_neighbours and not shared and len(previous) > 1:
-            shared = {"neighbours": find_neighbours(previous, problem.extent)}
-        rates = config.rates_at(epochs).by_parameter(problem.extent)
-        losses = optimise(optimizer, rates, losses_at, steps_of(epochs), weights)
+        rates = config.rates_at(epoch).by_parameter(problem.extent)
+        if recorded_steps is None and later_steps is not None:
+            recorded_steps = later_steps.of(previous, active.num_gaussians, problem.extent)
+        losses = optimise(optimizer, rates, losses_at, steps_of(epoch), weights, recorded_steps)
         psnr = pop_psnr(losses)
-        objectives.append(sum(weights[name] * loss for name, loss in losses.items()))
-        epochs += 1
+    if later_steps is not None:
+        view = views[indices[0]]
+        check_rendering(gaussians(), view.camera, ("color", "motion"), view.config)
     result, source = active.merge(problem.previous, gaussians(), source)
-    constant_errors = (problem.targets[v].constant_error(w.region) for v, w in active.views.items())
-    return LaterFrame(result, source, losses, epochs, psnr, fit_problem(psnr, constant_errors))
+    constant_errors = (view.target.constant_error(view.region) for view in views.values())
+    problem_text = fit_problem(psnr, constant_errors)
+    return LaterFrame(result, source, losses, len(order), psnr, problem_text)
 
 
 def _fit_motion(
@@ -246,10 +239,10 @@ def _fit_motion(
     start_gaussians = displaced(gaussians, start.displacement)
 
     def losses_at(parameters: Tensors, index: int) -> Tensors:
-        view = problem.active.views[index]
-        image = view.render(moved(start_gaussians, *model.motion(parameters)))
+        view = problem.views[index]
+        image = render_view(moved(start_gaussians, *model.motion(parameters)), view)
         return {
-            "recon": recon_loss(image.color, problem.targets[index], dssim_weight, view.region),
+            "recon": recon_loss(image.color, view.target, dssim_weight, view.region),
             **model.losses(parameters),
         }
 

@@ -11,8 +11,9 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.arrays import from_numpy, rows_of
 from morgs_mi.core.types import Arrays, Tensor, Tensors
+from morgs_mi.fit.frozen_step import RecordedSteps
 from morgs_mi.fit.view import decibels
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.objective import SQUARED_ERROR
@@ -43,7 +44,7 @@ def values_of(optimizer: Tensors) -> Tensors:
 
 
 def replace_parameter(
-    optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]
+    optimizer: Adam, name: str, value: Tensor, carry: Callable[[Tensor], Tensor]
 ) -> None:
     """Replace a parameter by one of another shape, and map Adam's moments to it, which are lost in
     an assignment.
@@ -51,16 +52,17 @@ def replace_parameter(
     Args:
         optimizer: its learning rates and its count of steps stay.
         name: name of the parameter.
-        value: its new value.
+        value: its new value, detached.
         carry: maps a moment of the old shape to one of the new shape.
     """
     # Dr.Jit 1.5 has no public access to the moments. `largest` is None unless AMSGrad is used.
-    _, is_promoted, rate, (steps, first, second, largest) = optimizer.state[name]
+    old_state: Any = optimizer.state[name]
+    _, is_promoted, rate, (steps, first, second, largest) = old_state
     shape = tuple(optimizer[name].shape)
-    moments = [from_numpy(mi.Float, carry(np.asarray(m).reshape(shape))) for m in (first, second)]
-    dr.make_opaque(moments)
-    optimizer[name] = from_numpy(mi.TensorXf, value)
-    state: Any = (optimizer.state[name][0], is_promoted, rate, (steps, *moments, largest))
+    moments = [carry(mi.TensorXf(moment, shape)).array for moment in (first, second)]
+    dr.schedule(value, moments)
+    dr.enable_grad(value)
+    state: Any = (value, is_promoted, rate, (steps, *moments, largest))
     optimizer.state[name] = state
 
 
@@ -79,16 +81,14 @@ def select_rows(
         is_birth: bool [M].
         edits: changes [M, ...] added to the parameters, by name.
     """
-
-    def carry(moment: np.ndarray) -> np.ndarray:
-        selection = moment[rows]
-        selection[is_birth] = 0
-        return selection
-
-    edits = edits or {}
+    lanes = from_numpy(mi.UInt32, rows)
+    survives = from_numpy(mi.Bool, ~is_birth)
     for name in list(optimizer):
-        value = np.asarray(dr.detach(optimizer[name]))[rows]
-        replace_parameter(optimizer, name, value + edits[name] if name in edits else value, carry)
+        value = rows_of(optimizer[name], lanes)
+        if edits and name in edits:
+            value = value + from_numpy(mi.TensorXf, edits[name])
+        replace_parameter(optimizer, name, value, lambda moment: rows_of(moment, lanes, survives))
+    dr.eval()
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,7 @@ def optimise(
     losses_at: Callable[[Tensors, int], Tensors],
     steps: Steps,
     weights: Mapping[str, float] | None = None,
+    recorded_steps: RecordedSteps | None = None,
 ) -> dict[str, float]:
     """Minimise the weighted sum of losses by one Adam step per view; the optimiser holds the
     parameters.
@@ -120,6 +121,7 @@ def optimise(
         losses_at: (parameters, view) -> losses by name; a view may lack some of them.
         steps: the steps.
         weights: weights of the losses by name; 1 where not named.
+        recorded_steps: the same steps as recordings; None: none.
 
     Returns:
         The mean of each loss over the last steps that had it, by name.
@@ -129,29 +131,56 @@ def optimise(
     """
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
     base_rates = {name: float(rates[name]) for name in optimizer}
-    optimizer.set_learning_rate(base_rates)
-    history = dict[str, list[Tensor]]()
-    weights = weights or {}
-    step = steps.first_step
-    for step, view in enumerate(steps.views, steps.first_step):
-        if steps.rate_factor is not None:
-            factor = steps.rate_factor(step)
-            optimizer.set_learning_rate({name: factor * rate for name, rate in base_rates.items()})
+    rows: list[tuple[tuple[str, ...], Any]] = []  # names and values of the losses of each step
+    observer = steps.observer
+
+    def make_step(view: int, rates: Mapping[str, float]) -> None:
+        optimizer.set_learning_rate(dict(rates))
         losses = losses_at(optimizer, view)
-        total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
-        term = None if steps.observer is None else steps.observer.term
+        total: Tensor = sum((weights or {}).get(name, 1.0) * loss for name, loss in losses.items())
+        term = None if observer is None else observer.term
         with render_lock:
             dr.backward(total if term is None else total + term)
-        if steps.observer is not None:
-            steps.observer.collect()
+        if observer is not None:
+            observer.collect()
+        values = dr.empty(mi.Float, len(losses))
+        for k, loss in enumerate(losses.values()):
+            dr.scatter(values, dr.ravel(dr.detach(loss)), mi.UInt32(k))
         optimizer.step()
-        for name, loss in losses.items():
-            history.setdefault(name, []).append(dr.detach(loss))
+        rows.append((tuple(losses), values))
+
+    def finish_recorded(recorded: RecordedSteps) -> None:
+        pending = recorded.pending
+        results = recorded.finish(optimizer) if pending else []
+        if results is None:
+            for view, rates in pending:
+                make_step(view, rates)
+        else:
+            rows.extend((tuple(losses), [*losses.values()]) for losses in results)
+            if observer is not None and results:
+                observer.update(len(results), recorded.scores)
+
+    step = steps.first_step
+    for step, view in enumerate(steps.views, steps.first_step):
+        factor = 1.0 if steps.rate_factor is None else steps.rate_factor(step)
+        rates = {name: factor * rate for name, rate in base_rates.items()}
+        if recorded_steps is None:
+            make_step(view, rates)
+        else:
+            is_scored = observer is not None and observer.skip <= len(recorded_steps.pending)
+            recorded_steps.step(optimizer, view, rates, is_scored)
+            if recorded_steps.is_full:
+                finish_recorded(recorded_steps)
         if steps.on_step is not None:
             steps.on_step(step + 1)
+    if recorded_steps is not None:
+        finish_recorded(recorded_steps)
+    history: dict[str, list[float]] = {}
+    for names, values in rows:
+        for name, value in zip(names, np.asarray(values).tolist(), strict=True):
+            history.setdefault(name, []).append(value)
     means = {
-        name: float(np.mean([np.asarray(loss).item() for loss in losses[-steps.averaged_steps :]]))
-        for name, losses in history.items()
+        name: float(np.mean(losses[-steps.averaged_steps :])) for name, losses in history.items()
     }
     broken_losses = [name for name, mean in means.items() if not np.isfinite(mean)]
     if broken_losses:

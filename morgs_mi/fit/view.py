@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import valid_pixels
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.view import View
+from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
@@ -21,7 +22,6 @@ LEAST_GAIN = 0.1
 chance.
 """
 
-MIN_SIDE = 32  # px, of a reduced image
 # Mean squared error of 100 dB.
 _LEAST_ERROR = 1e-10
 # Least width of views of half the size, px.
@@ -30,35 +30,6 @@ COARSE_WIDTH = 160
 _BLOCK = 12
 # One of so many blocks is withheld.
 _SHARE = 8
-
-
-class View(NamedTuple):
-    """A camera and its image."""
-
-    camera: Camera  #: The camera.
-    #: [H, W, 3], encoded: uint8, or float32 with values above 1 of an HDR recording.
-    image: np.ndarray
-    mask: np.ndarray | None = None  #: Valid pixels [H, W] bool, or None if all are.
-
-    @property
-    def white(self) -> float:
-        """Value at which the recording was clipped: 1, or infinity for an HDR recording."""
-        return 1.0 if self.image.dtype == np.uint8 else np.inf
-
-    def reduced(self, width: int) -> View:
-        """Return the view reduced by the largest whole factor that leaves a width.
-
-        A reduced pixel is valid if all pixels that it covers are.
-        """
-        factor = self.camera.width // width
-        if factor < 2 or self.camera.height // factor < MIN_SIDE:
-            return self
-        size = (self.camera.width // factor, self.camera.height // factor)
-        image = np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA))
-        if self.mask is None:
-            return View(self.camera.resized(*size), image)
-        share = cv2.resize(self.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        return View(self.camera.resized(*size), image, share > 0.999)
 
 
 def half_sized(views: Sequence[View]) -> list[View]:
@@ -79,13 +50,14 @@ def withheld_blocks(
     """
     visible = []
     withheld = []
-    for camera, image, mask in (view.reduced(width) for view in views):
-        rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
+    for view in views:
+        view = view.reduced(width)
+        rows, columns = (np.arange(size) // _BLOCK for size in view.image.shape[:2])
         blocks = rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE
         is_withheld = blocks[rows][:, columns]
-        valid = valid_pixels(mask, is_withheld.shape)
-        visible.append(View(camera, image, valid & ~is_withheld))
-        withheld.append(View(camera, image, valid & is_withheld))
+        valid = valid_pixels(view.mask, is_withheld.shape)
+        visible.append(replace(view, mask=valid & ~is_withheld))
+        withheld.append(replace(view, mask=valid & is_withheld))
     return visible, withheld
 
 

@@ -27,13 +27,13 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.special import expit
 
-from morgs_mi.core.checks import few
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
+from morgs_mi.platform.checks import few
+from morgs_mi.platform.files import atomic_path
 
 _CHUNK = 256
 _BOUNDS = {

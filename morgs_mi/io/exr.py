@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import OpenEXR
 
-from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.color_space import positive_light
-from morgs_mi.core.files import atomic_path
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
+from morgs_mi.platform.bounded import check_claim
+from morgs_mi.platform.files import atomic_path
 
 # Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
 _REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)

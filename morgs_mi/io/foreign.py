@@ -24,15 +24,22 @@ def refuse_foreign(path: str | Path) -> None:
     """Raise an error if a file has Gaussians in a format that is not read.
 
     Raises:
-        ValueError: it does; the sentence names what converts it.
+        ValueError: the format is another one; the sentence names what converts it.
     """
     name = Path(path).name.lower()
-    remedies = [words for endings, words in _REMEDIES.items() if name.endswith(endings)]
-    if not name.endswith(".ply") and Path(path).is_file():
-        with open(path, "rb") as file:
-            remedies += ["rename it to .ply"] * (file.read(4) in (b"ply\n", b"ply\r"))
-    for remedy in remedies:
+    remedy = next((words for endings, words in _REMEDIES.items() if name.endswith(endings)), None)
+    if remedy is None and not name.endswith(".ply") and _is_ply(Path(path)):
+        remedy = "rename it to .ply"
+    if remedy is not None:
         raise ValueError(
             f"{path}: expected Gaussians as .ply, .compressed.ply or .splat, which {name} is not; "
             f"{remedy}."
         )
+
+
+def _is_ply(path: Path) -> bool:
+    """Return whether a path is a file that begins as PLY files do."""
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return file.read(4) in (b"ply\n", b"ply\r")

@@ -16,11 +16,11 @@ import cv2
 import imagesize
 import numpy as np
 
-from morgs_mi.core.bounded import check_claim
-from morgs_mi.core.png import has_whole_chunks
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
 from morgs_mi.io.numbering import check_counting, check_numbering, frame_numbers, natural_key
+from morgs_mi.platform.bounded import check_claim
+from morgs_mi.platform.png import has_whole_chunks
 
 WHITE = 2**16 - 1
 """White of images of 16 bits, unless a capture sets another one."""

@@ -26,12 +26,12 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
-from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply_kinds import as_3dgs
+from morgs_mi.platform.files import atomic_path
 
 _MEAN = ("x", "y", "z")
 _SCALE = ("scale_0", "scale_1", "scale_2")

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.checks import few
 from morgs_mi.core.types import Arrays
+from morgs_mi.platform.checks import few
 
 _log = logging.getLogger(__name__)
 

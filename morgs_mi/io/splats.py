@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.checks import LARGEST, few
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply import read_ply
+from morgs_mi.platform.checks import LARGEST, few
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +34,17 @@ _WORDS = {
     "logit_confidence": "confidence",
 }
 _MOST_NAMED = 3
+SUFFIXES = (".compressed.ply", ".ply", ".splat")
+"""Ends of the names of files that `read_splats` reads."""
+_RECORD = np.dtype(
+    [
+        ("means", "<f4", 3),
+        ("scales", "<f4", 3),
+        ("color", "u1", 3),
+        ("opacity", "u1"),
+        ("quats", "u1", 4),
+    ]
+)
 
 
 @np.errstate(invalid="ignore")  # of NaN that signal, which a damaged file may have
@@ -102,20 +113,6 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         details,
     )
     return gaussians.select(every)
-
-
-SUFFIXES = (".compressed.ply", ".ply", ".splat")
-"""Ends of the names of files that `read_splats` reads."""
-
-_RECORD = np.dtype(
-    [
-        ("means", "<f4", 3),
-        ("scales", "<f4", 3),
-        ("color", "u1", 3),
-        ("opacity", "u1"),
-        ("quats", "u1", 4),
-    ]
-)
 
 
 def suffix_of(path: str | Path) -> str | None:

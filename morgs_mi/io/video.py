@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 import cv2
 import numpy as np
 
-from morgs_mi.core.checks import errors_at
 from morgs_mi.io.frame_times import clock, time_code_seconds, true_rate
 from morgs_mi.io.images import WHITE, Frames, ImageOrError, eight_bits
 from morgs_mi.io.listing import existing_file
+from morgs_mi.platform.checks import errors_at
 
 if TYPE_CHECKING:
     import av  # imported where a video is opened, as it takes 80 ms
@@ -85,46 +85,13 @@ class VideoReader(Frames):
             ValueError: it is empty, FFmpeg cannot decode it, or its time stamps are broken.
         """
         path = Path(path)
-        with _opened(path) as (container, stream):
-            num_indexed = len(stream.index_entries)
-            hidden = sum(entry.is_discard for entry in stream.index_entries)
-            first = None
-            packets = []
-            for packet in _unbroken(partial(container.demux, stream)):
-                if first is None:
-                    first = next(_unbroken(packet.decode), None)
-                if packet.size:
-                    packets.append((packet.pts, packet.is_discard, packet.is_corrupt))
-            if first is None:
-                raise _unreadable(path, "no frame can be decoded")
-            with errors_at(path):
-                height, width = _shown(np.empty((first.height, first.width)), first).shape
-            fps = float(stream.guessed_rate or 0)
-            shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
-            # Without stamps, if a packet has none, or two have the same.
-            stamps = None
-            present = {time for time in shown if time is not None}
-            if first.pts is not None and len(present) == len(shown):
-                stamps = np.array(sorted(t for t in present if t >= first.pts), np.int64)
-            num_held = len(shown if stamps is None else stamps)
-            num_frames = stream.frames - hidden if stream.frames else 0
-            if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
-                num_frames = num_held  # headers also count what edit lists and null frames hide
-            length = _length(container, stream, first)
-            unit = float(stream.time_base or 0)
-            # AVI has no others; of some codecs, FFmpeg finds those of the frames.
-            are_of_decoding = (
-                container.format.name == "avi"
-                and stream.codec_context.has_b_frames
-                and shown == sorted(shown, key=lambda time: time or 0)
-            )
-            start = time_code_seconds(_time_code(container), fps)
-            is_deep = first.format.components[0].bits == 16
-            most = int(first.to_ndarray(format="rgb48le").max()) if is_deep else None
-            notes = tuple(_unused_properties(container, stream, first))
+        probe = _probe(path)
+        fps = probe.fps
+        num_held = probe.num_held
+        num_frames = probe.num_frames
         positions = times = None
-        if stamps is not None and num_held > 1:
-            times = (stamps - stamps[0]) * unit
+        if probe.stamps is not None and num_held > 1:
+            times = (probe.stamps - probe.stamps[0]) * probe.time_unit
             periods = num_held - 1.0
             if (regular := clock(times)) is not None:
                 positions, rate = regular
@@ -136,24 +103,24 @@ class VideoReader(Frames):
                     )
             fps = true_rate(fps, periods, float(times[-1]))
             # A header may have the length of another stream's last packet.
-            if not num_frames and length * fps > periods + 1.5:
-                num_frames = round(length * fps)
+            if not num_frames and probe.length * fps > periods + 1.5:
+                num_frames = round(probe.length * fps)
         if not num_held <= num_frames <= path.stat().st_size:  # a frame takes more than a byte
             num_frames = num_held
         return cls(
             path,
             num_frames,
             fps or None,
-            width,
-            height,
+            probe.width,
+            probe.height,
             num_held,
             positions,
             # Decoded frames are in order, but have each other's times.
-            None if are_of_decoding else stamps,
+            None if probe.are_decoding_times else probe.stamps,
             times,
-            start,
-            most,
-            notes=notes,
+            probe.start,
+            probe.most,
+            notes=probe.notes,
         )
 
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
@@ -232,6 +199,79 @@ class VideoReader(Frames):
                     yield head
                     yield from numbered
                     return
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """What a video's header, packets and first frame say."""
+
+    width: int  #: Of the first frame as players show it, in pixels.
+    height: int  #: In pixels.
+    fps: float  #: Frames per second as FFmpeg guesses them; 0 if unknown.
+    num_frames: int  #: Number of frames that the header states; 0 without one.
+    num_held: int  #: Number of frames that the packets hold.
+    stamps: np.ndarray | None  #: As of `VideoReader`, or decoding times.
+    time_unit: float  #: Seconds of a unit of the stamps.
+    length: float  #: Seconds that the header states; 0 without them.
+    are_decoding_times: bool  #: Whether the stamps are decoding times.
+    start: float  #: Time code of the first frame, s; NaN if there is none.
+    most: int | None  #: As of `FolderReader`.
+    notes: tuple[str, ...]  #: As of `VideoReader`.
+
+
+def _probe(path: Path) -> _Probe:
+    """Return what a video says; the first frame is decoded, and the packets are read.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is empty, or FFmpeg cannot decode it.
+    """
+    with _opened(path) as (container, stream):
+        num_indexed = len(stream.index_entries)
+        hidden = sum(entry.is_discard for entry in stream.index_entries)
+        first = None
+        packets = []
+        for packet in _unbroken(partial(container.demux, stream)):
+            if first is None:
+                first = next(_unbroken(packet.decode), None)
+            if packet.size:
+                packets.append((packet.pts, packet.is_discard, packet.is_corrupt))
+        if first is None:
+            raise _unreadable(path, "no frame can be decoded")
+        with errors_at(path):
+            height, width = _shown(np.empty((first.height, first.width)), first).shape
+        shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
+        # Without stamps, if a packet has none, or two have the same.
+        stamps = None
+        present = {time for time in shown if time is not None}
+        if first.pts is not None and len(present) == len(shown):
+            stamps = np.array(sorted(t for t in present if t >= first.pts), np.int64)
+        num_held = len(shown if stamps is None else stamps)
+        num_frames = stream.frames - hidden if stream.frames else 0
+        if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
+            num_frames = num_held  # headers also count what edit lists and null frames hide
+        # AVI stores decoding times alone; for some codecs, FFmpeg derives the times of display.
+        are_decoding_times = (
+            container.format.name == "avi"
+            and stream.codec_context.has_b_frames
+            and shown == sorted(shown, key=lambda time: time or 0)
+        )
+        fps = float(stream.guessed_rate or 0)
+        is_deep = first.format.components[0].bits == 16
+        return _Probe(
+            width,
+            height,
+            fps,
+            num_frames,
+            num_held,
+            stamps,
+            float(stream.time_base or 0),
+            _length(container, stream, first),
+            are_decoding_times,
+            time_code_seconds(_time_code(container), fps),
+            int(first.to_ndarray(format="rgb48le").max()) if is_deep else None,
+            tuple(_unused_properties(container, stream, first)),
+        )
 
 
 @contextmanager

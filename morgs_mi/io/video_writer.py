@@ -10,9 +10,9 @@ from typing import cast
 
 import numpy as np
 
-from morgs_mi.core.checks import require
-from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.core.png import png_bytes
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.files import atomic_folder, atomic_path
+from morgs_mi.platform.png import png_bytes
 
 FFV1 = "ffv1"
 """Encoder of lossless videos, in .mp4 too, which no browser plays."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,25 +14,30 @@ from numpy.typing import ArrayLike
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_type, numbers
-from morgs_mi.core.config import config_or_default
-from morgs_mi.core.extras import extra, places
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
+from morgs_mi.core.view import View, Views
 from morgs_mi.fit.balance import balance_cameras, short_fit_config
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.fit.initialise import MIN_POINTS, FirstFrameProblem, unseen_points
+from morgs_mi.fit.image_points import image_points
+from morgs_mi.fit.initialise import (
+    MANY_POINTS,
+    MIN_POINTS,
+    FirstFrameProblem,
+    Points,
+    has_points,
+    unseen_points,
+)
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.input_images import Frame, Images
+from morgs_mi.loop.input_images import FrameImages, Images
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
     Setup,
     observe_frame,
+    over_border,
     prepare,
     views_of,
 )
@@ -40,6 +45,12 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
+from morgs_mi.platform.checks import check_type, numbers, require
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.extras import extra, places
+from morgs_mi.platform.interrupts import interrupts_raised
+from morgs_mi.platform.progress import Progress, Report, duration
+from morgs_mi.render.render_config import RenderConfig
 
 _LOG = logging.getLogger(__name__)
 # Rounds of a preview, and the steps of the first one: 24 dB on basketball after two.
@@ -47,17 +58,31 @@ _PREVIEWS = 3
 _PREVIEW_STEPS = 500
 
 
+@dataclass(frozen=True, eq=False)
+class FittedImages:
+    """Result of `fit_gaussians`."""
+
+    gaussians: Gaussians  #: The Gaussians.
+    render: RenderConfig  #: Settings they are drawn with, and the background, given or found.
+    report: FrameReport  #: Of the fit.
+
+    @property
+    def background(self) -> tuple[float, float, float] | None:
+        """Colour behind all Gaussians, encoded; None: black, or the images of the cameras."""
+        return self.render.background
+
+
 @interrupts_raised()
 def fit_gaussians(
     sensors: Sequence[Any],
-    images: Frame,
+    images: FrameImages,
     points: np.ndarray | None = None,
     point_colors: np.ndarray | None = None,
     config: StreamConfig | None = None,
     masks: Sequence[np.ndarray | None] | None = None,
     background: ArrayLike | None = None,
     progress: Report | None = None,
-) -> Gaussians:
+) -> FittedImages:
     """Return Gaussians fitted to images of one timestamp, as `StreamLoop` fits its first frame:
     with its starts, balance of the cameras, density control and dropout.
 
@@ -66,22 +91,26 @@ def fit_gaussians(
         images: an image [H, W, 3] per view: uint8 in sRGB, linear light as a float array or a
             `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. A dict has them by the
             names of the views.
-        points: [P, 3] of the scene, world units; None, fewer than 20, or points of which the
-            cameras see less than 5 %: random ones inside the views.
+        points: [P, 3] of the scene, world units. None, fewer than 20, or points of which the
+            cameras see less than 5 %: those that matched images show, or, if these are fewer than
+            1000, random ones where views agree (see `seed_points`).
         point_colors: [P, 3], encoded: 1 is white; None: grey.
         config: settings of the first frame and the renderer; None: the defaults.
         masks: per view [H, W] bool of valid pixels, or None.
         background: colour [3] behind all Gaussians, encoded: 1 is white; or an image [V, H, W, 3],
-            as of `Camera`; None: that of the cameras and the config.
+            as of `Camera`. None: the background of the cameras and the config; if these have none
+            and there are no points, the colour that the borders of the images have in common.
         progress: called with (stage, done, total).
 
     Example:
-        >>> gaussians = morgs_mi.fit_gaussians(scene.sensors(), [mi.render(scene, sensor=s)
-        ...                                                      for s in scene.sensors()])
+        >>> fitted = morgs_mi.fit_gaussians(scene.sensors(), [mi.render(scene, sensor=s)
+        ...                                                   for s in scene.sensors()])
+        >>> image = morgs_mi.rasterize(fitted.gaussians, scene.sensors()[0], config=fitted.render)
 
     Raises:
         ValueError: as for `StreamLoop` and `StreamLoop.push`.
     """
+    begin = time.perf_counter()
     points = np.zeros((0, 3)) if points is None else points
     point_colors = np.full(np.shape(points), 0.5) if point_colors is None else point_colors
     check_type("fit_gaussians()", "sensors", sensors, Sequence, "pass a list")
@@ -95,14 +124,27 @@ def fit_gaussians(
         else:
             numbers("fit_gaussians()", "background", behind, len(cameras), *behind.shape[1:])
             cameras = [replace(camera, background=behind[v]) for v, camera in enumerate(cameras)]
-    setup = prepare(cameras, points, point_colors, config, masks)
+    masks = [None] * len(cameras) if masks is None else masks
+    check_type("fit_gaussians()", "masks", masks, Sequence, "pass a list")
+    require(
+        len(masks) == len(cameras),
+        "fit_gaussians()",
+        f"`masks` must have one mask or None for each of {len(cameras)} views",
+        len(masks),
+        "pass None where all pixels are valid",
+    )
+    pairs = zip(cameras, masks, strict=True)
+    views = [View(camera, mask=mask) for camera, mask in pairs]
+    setup = over_border(prepare(views, points, point_colors, config), images)
     observed = observe_frame(setup, 0, ImageHistory(), images)
     warn_of_order(setup, images, observed.history.images)
-    packet, _ = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
-    return decode(None, packet).gaussians
+    packet, report = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
+    seconds = time.perf_counter() - begin
+    report = replace(report, seconds=seconds, status=report.status or "ok")
+    return FittedImages(decode(None, packet).gaussians, setup.config.render, report)
 
 
-def warn_of_order(setup: Setup, images: Frame, present: Images) -> None:
+def warn_of_order(setup: Setup, images: FrameImages, present: Images) -> None:
     """Warn if images seem to be in another order than the cameras; in a dict they have names.
 
     Args:
@@ -110,10 +152,9 @@ def warn_of_order(setup: Setup, images: Frame, present: Images) -> None:
         images: of the first frame, as they were given.
         present: those that exist as a display shows them, by view index.
     """
-    if not isinstance(images, Mapping):
-        for name in places("image checks"):
-            for problem in extra("image checks", name)(views_of(setup, present)):
-                _LOG.warning("frame 0: %s", problem)
+    if not isinstance(images, Mapping | Views) and "problems" in places("cameras"):
+        for problem in extra("cameras", "problems")(views_of(setup, present)):
+            _LOG.warning("frame 0: %s", problem)
 
 
 def fitted_first_frame(
@@ -133,9 +174,9 @@ def fitted_first_frame(
     begin = time.perf_counter()
     config = setup.config
     problems = [unseen_points(setup.cameras, setup.points)]
-    if problems[0]:
-        none = np.zeros((0, 3))
-        setup = replace(setup, points=none, point_colors=none)
+    if not has_points(setup.cameras, setup.points):
+        points, colors = _found_points(setup, observed.history.images, progress)
+        setup = replace(setup, points=points, point_colors=colors)
     on_round = _on_round(setup, on_provisional)
     exposures, exposure_entry = _balanced(setup, observed.encoded, progress, on_round)
     views = views_of(setup, corrected(observed.encoded, exposures))
@@ -154,13 +195,26 @@ def fitted_first_frame(
         expected = forecast(problem.cameras, problem.points)
         quality = {"sentence": expected.sentence, "quality": expected.quality}
         validation = {**quality, **asdict(expected), **exposure_entry}
-    stage = "First frame" + ("" if seconds is None else f", about {max(seconds, 1):.0f} s")
     limit = config.fit.first_frame_seconds
+    forecast_text = ""
     if seconds is None:  # both numbers are given
         limit = None
-    elif limit is not None:
+    elif limit is not None:  # whose seconds are counted
         limit = max(limit - (time.perf_counter() - begin), 1.0)
-    fitted = fit_first_frame(problem, fit_config, rng, progress.of(stage), on_round, limit)
+    else:
+        forecast_text = f", about {duration(max(seconds, 1))}"
+    stage = progress.forecast("First frame", forecast_text)
+    stage(0, 1)
+    begin = time.perf_counter()
+    fitted = fit_first_frame(problem, fit_config, rng, stage, on_round, limit)
+    if fitted.steps < plan.planned_steps:  # to keep the limit
+        seconds = time.perf_counter() - begin
+        whole = duration(seconds * plan.planned_steps / fitted.steps)
+        sentence = (
+            f"{fitted.steps:,} of {plan.planned_steps:,} planned steps in {seconds:.0f} s: a "
+            f"draft; about {whole} for all."
+        )
+        validation["draft"] = {"sentence": sentence, "planned_steps": plan.planned_steps}
     problems = list(filter(None, [*problems, fitted.problem]))
     for sentence in problems:
         _LOG.warning("frame 0: %s", sentence)
@@ -180,16 +234,29 @@ def fitted_first_frame(
     return packet, report
 
 
-def preview(setup: Setup, images: Frame, on_provisional: Callable[[Packet], None]) -> None:
+def _found_points(setup: Setup, images: Images, progress: Progress) -> Points:
+    """Return the points that are found in images of uint8, none if these are too few to cover the
+    views.
+    """
+    progress.of("Matching views")(0, 1)
+    rng = rng_of(setup.config.seed, Stream.POINTS)
+    points, colors = image_points(views_of(setup, images), rng)
+    count = len(points) if len(points) >= MANY_POINTS else 0
+    return points[:count], colors[:count]
+
+
+def preview(
+    setup: Setup, images: FrameImages, progress: Progress, on_provisional: Callable[[Packet], None]
+) -> None:
     """Make provisional keyframes by short fits of the first frame, for a picture within seconds
-    while better points are still to be found; arguments as for `step`.
+    while better points are still to be found; arguments as for `step`, and the stage's progress.
     """
     fit = setup.config.fit
     short_fits = replace(fit.short_fits, rounds=_PREVIEWS, steps=_PREVIEW_STEPS)
     config = replace(setup.config, fit=replace(fit, exposure="on", short_fits=short_fits))
     setup = replace(setup, config=config)
     observed = observe_frame(setup, 0, ImageHistory(), images)
-    _balanced(setup, observed.encoded, Progress(), _on_round(setup, on_provisional))
+    _balanced(setup, observed.encoded, progress.part(0, 1), _on_round(setup, on_provisional))
 
 
 def _on_round(
@@ -230,7 +297,7 @@ def _balanced(
             "recorded_psnr": balance.recorded_psnr,
             "balanced_psnr": balance.balanced_psnr,
         }
-    return tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras))), entry
+    return tuple(exposures.get(v, Exposure()) for v in range(len(setup.views))), entry
 
 
 def corrected(images: Images, exposures: Sequence[Exposure]) -> dict[int, np.ndarray]:

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from morgs_mi.core.checks import quantity
 from morgs_mi.method.exposure import Exposure
+from morgs_mi.platform.checks import quantity
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class FrameReport:
             of the active set in later ones. NaN if nothing was fitted.
         status: "ok", or a sentence about a problem and how it was handled.
         missing_views: names of the views without an image.
-        active: fractions that took part, by name: gaussians, views, pixels, epochs.
+        active: fractions that took part, by name: gaussians, views, pixels.
         validation: of the first frame, a `sentence` on views between the cameras, with the fields
             of `Forecast` (see `fit.forecast`); empty with a single view.
         steps: number of optimisation steps.

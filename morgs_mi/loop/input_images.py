@@ -12,20 +12,38 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import kind_of
 from morgs_mi.core.color_space import positive_light
-from morgs_mi.core.threads import map_in_threads
+from morgs_mi.core.view import View, Views
 from morgs_mi.method.exposure import thumbnail
+from morgs_mi.platform.checks import kind_of
+from morgs_mi.platform.threads import map_in_threads
 
 InputImage: TypeAlias = Any
 """An image [H, W, 3]: a uint8 array in sRGB; linear light as a float array or a `mi.TensorXf`; or a
 `mi.Bitmap`, whose flag `srgb_gamma` counts."""
 
-Frame: TypeAlias = "Sequence[InputImage | None] | Mapping[str, InputImage | None]"
-"""One image or None for each view in the cameras' order, or the images by the cameras' names."""
+FrameImages: TypeAlias = (
+    "Sequence[InputImage | None] | Mapping[str, InputImage | None] | Views[View]"
+)
+"""One image or None for each view in the cameras' order, the images by the cameras' names, or
+views with their images, such as ``frame.train`` of a capture's frames."""
 Images = Mapping[int, np.ndarray]
 """Images of those views that have one, by view index."""
+# px: thumbnails of this width keep the layout of a scene, without noise and the motion between two
+# frames.
+_WIDTH = 16
+# Standard deviation of the thumbnail of an image of one colour, in grey levels.
+_PLAIN = 2.0
+# Mean of a black image, in grey levels.
+_BLACK = 16.0
+# Correlation of the thumbnails of successive frames; it is 0.95 and more in recordings, and 0.7 and
+# less at cuts.
+_SAME_SCENE = 0.8
+# Share of a thumbnail that changes by more than some grey levels: a few percent in recordings, half
+# of it at cuts. A bright object alone, in fast motion before a dull scene, changes the correlation
+# and less of the thumbnail.
+_LEAST_CHANGED = 0.4
+_CHANGE = 8.0
 
 
 def as_array(image: Any) -> Any:
@@ -42,13 +60,13 @@ def as_array(image: Any) -> Any:
 
 
 def copied_images(
-    cameras: Sequence[Camera], images: Frame, frame: int, kind: str = ""
+    views: Sequence[View], images: FrameImages, frame: int, kind: str = ""
 ) -> dict[int, np.ndarray]:
     """Return copies of the images of those views that have one, by view index, negative light set
     to 0.
 
     Args:
-        cameras: the views.
+        views: the views.
         images: of the frame.
         frame: its index.
         kind: numbers of the images of earlier frames, uint8 or float32; empty: there are none.
@@ -58,26 +76,26 @@ def copied_images(
             is not finite or has 255 for white, or other numbers than the images before it, or the
             first frame has no image at all.
     """
-    images = in_order(cameras, images, frame)
+    images = in_order(views, images, frame)
     if not frame and all(image is None for image in images):
         raise ValueError(
             "push(): frame 0 must have an image of at least one view, got none; begin with one "
             "that has."
         )
     copies = {}
-    for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+    for v, (view, image) in enumerate(zip(views, images, strict=True)):
         if image is None:
             continue
-        place = f"push(): frame {frame} of view {camera.name or view!r}"
+        place = f"push(): frame {frame} of view {view.name or v!r}"
         array = as_array(image)
-        shape = (camera.height, camera.width, 3)
+        shape = (view.camera.height, view.camera.width, 3)
         is_image = isinstance(array, np.ndarray) and array.shape == shape
         if is_image and array.dtype == np.uint8:
-            copies[view] = array.copy()
+            copies[v] = array.copy()
         elif is_image and array.dtype.kind == "f":
-            copies[view] = positive_light(array, place)
-            most = copies[view].max()
-            if most == 255 or (2 < most < 2**16 and (copies[view] % 1 == 0).all()):
+            copies[v] = positive_light(array, place)
+            most = copies[v].max()
+            if most == 255 or (2 < most < 2**16 and (copies[v] % 1 == 0).all()):
                 raise ValueError(
                     f"{place} must be linear light with 1 for white where it is floats, got values "
                     f"up to {most:g}, as integers have; pass uint8 in sRGB, or divide linear light "
@@ -97,14 +115,16 @@ def copied_images(
     return copies
 
 
-def in_order(cameras: Sequence[Camera], images: Any, frame: int) -> list[InputImage | None]:
-    """Return the images of a frame in the cameras' order.
+def in_order(views: Sequence[View], images: Any, frame: int) -> list[InputImage | None]:
+    """Return the images of a frame in the order of the views.
 
     Raises:
         ValueError: the number of images differs from the number of cameras, or a name does not
             belong to exactly one camera.
     """
-    names = [camera.name for camera in cameras]
+    names = [view.name for view in views]
+    if isinstance(images, Views):
+        images = {view.name: view.image if view.has_image else None for view in images}
     if isinstance(images, Mapping) and all(names.count(name) == 1 for name in images):
         return [images.get(name) for name in names]
     is_sequence = isinstance(images, (Sequence, np.ndarray))
@@ -117,23 +137,6 @@ def in_order(cameras: Sequence[Camera], images: Any, frame: int) -> list[InputIm
             f"got {content}."
         )
     return list(images)
-
-
-# px: thumbnails of this width keep the layout of a scene, without noise and the motion between two
-# frames.
-_WIDTH = 16
-# Standard deviation of the thumbnail of an image of one colour, in grey levels.
-_PLAIN = 2.0
-# Mean of a black image, in grey levels.
-_BLACK = 16.0
-# Correlation of the thumbnails of successive frames; it is 0.95 and more in recordings, and 0.7 and
-# less at cuts.
-_SAME_SCENE = 0.8
-# Share of a thumbnail that changes by more than some grey levels: a few percent in recordings, half
-# of it at cuts. A bright object alone, in fast motion before a dull scene, changes the correlation
-# and less of the thumbnail.
-_LEAST_CHANGED = 0.4
-_CHANGE = 8.0
 
 
 def image_status(names: Sequence[str], previous: Images, images: Images) -> tuple[str, ...]:

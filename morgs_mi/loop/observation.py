@@ -6,29 +6,42 @@ while this one is fitted.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.camera import OF_SENSOR, Camera
-from morgs_mi.core.checks import check_mask, check_number, check_points, check_type
 from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
-from morgs_mi.core.config import config_or_default
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
-from morgs_mi.core.threads import map_in_threads
+from morgs_mi.core.view import View, Views
 from morgs_mi.fit.budget import check_capacity
-from morgs_mi.fit.view import View
-from morgs_mi.loop.input_images import Frame, Images, copied_images
+from morgs_mi.fit.far_views import are_around
+from morgs_mi.fit.initialise import border_color, has_points, mean_color
+from morgs_mi.loop.input_images import FrameImages, Images, copied_images
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region
-from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
+from morgs_mi.method.exposure import (
+    LEAST_CHANGE,
+    Exposure,
+    common_change,
+    fit_exposure,
+    reduced,
+)
 from morgs_mi.method.flow import FlowObservation, observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.objective import KeyView
+from morgs_mi.platform.checks import check_mask, check_number, check_points, check_type
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.threads import in_background, map_in_threads
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,21 +69,33 @@ class FrameObservation:
     history: ImageHistory  #: The images, with those before.
     #: Masks of changed pixels [H, W], by view index; None: all pixels may have changed.
     changes: Mapping[int, np.ndarray] | None
-    #: Optical flow of the key views that changed, by view index.
-    flows: Mapping[int, FlowObservation]
-    key_views: Mapping[int, KeyView]  #: These views for the terms of the objective, by view index.
     #: Images that the fit compares, encoded, by view index: `history.images` where uint8 was given,
     #: otherwise float32 with values above 1.
     encoded: Images
     recorded: Images  #: The images as they were given, by view index.
+    pending_key_views: Future[dict[int, KeyView]]  #: See `key_views`.
+
+    @property
+    def key_views(self) -> dict[int, KeyView]:
+        """The key views that changed, with their optical flow, by view index. Another thread
+        computes them, for which this waits.
+
+        Raises:
+            OSError: flow is read from files and one is missing.
+        """
+        return self.pending_key_views.result()
+
+    @property
+    def flows(self) -> dict[int, FlowObservation]:
+        """Optical flow of these views, likewise."""
+        return {v: view.flow for v, view in self.key_views.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
     """Data that all frames share; made by `prepare`."""
 
-    cameras: tuple[Camera, ...]  #: The V training views.
-    masks: tuple[np.ndarray | None, ...]  #: Per view [H, W] bool of valid pixels, or None.
+    views: Views[View]  #: The V training views, without images.
     points: np.ndarray  #: SfM points [P, 3], world units.
     point_colors: np.ndarray  #: [P, 3], encoded: 1 is white.
     key_views: tuple[int, ...]  #: Indices of the views with optical flow and masks.
@@ -80,37 +105,41 @@ class Setup:
     #: first frame determines it, see `display_stops`.
     display_exposure: float | None = None
 
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of the views."""
+        return self.views.cameras
+
 
 def prepare(
-    cameras: Sequence[Camera],
+    views: Sequence[View | Camera],
     points: np.ndarray,
     point_colors: np.ndarray,
     config: StreamConfig | None = None,
-    masks: Sequence[np.ndarray | None] | None = None,
     display_exposure: float | None = None,
 ) -> Setup:
     """Return the data that all frames share; arguments and errors as for `StreamLoop`."""
     config = config_or_default("StreamLoop()", config, StreamConfig())
-    if not isinstance(cameras, Sequence) or not cameras:
-        kind = f"a {type(cameras).__name__}" if cameras else "none"
+    if not isinstance(views, Sequence) or not views:
+        kind = f"a {type(views).__name__}" if views else "none"
         raise ValueError(
-            f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a "
+            f"StreamLoop(): `views` must be a sequence of at least one view, got {kind}; pass a "
             "list."
         )
-    for camera in cameras:
-        check_type("StreamLoop()", "cameras", camera, Camera, OF_SENSOR)
-    points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
-    masks = (None,) * len(cameras) if masks is None else masks
-    check_type("StreamLoop()", "masks", masks, Sequence, "pass a list")
-    if len(masks) != len(cameras):
-        raise ValueError(
-            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "
-            f"got {len(masks)}; pass None where all pixels are valid."
-        )
-    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+    setup_views = []
+    for v, view in enumerate(views):
+        if not isinstance(view, View):
+            check_type("StreamLoop()", "views", view, Camera, OF_SENSOR)
+            view = View(view)
+        mask = view.mask
         if mask is not None:
-            place = f"StreamLoop(): view {camera.name or view!r}"
-            check_mask(place, mask, camera.height, camera.width)
+            place = f"StreamLoop(): view {view.name or v!r}"
+            check_mask(place, mask, view.camera.height, view.camera.width)
+            mask = mask.copy()
+        setup_views.append(View(view.camera, mask=mask))
+    setup_views = Views(setup_views)
+    cameras = setup_views.cameras
+    points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
     # An error now, not at the second frame, if a file that a method names is missing.
@@ -118,22 +147,52 @@ def prepare(
     FLOW_SOURCES.make(motion.flow_method, motion.flow)
     MASK_REFINERS.make(motion.mask_method, motion.masks)
     MOTION_MODELS.make(motion.model, motion)
-    copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, motion.key_views)
     extent = scene_extent(cameras)
     if display_exposure is not None:
         check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
-    return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
+    return Setup(setup_views, *cloud, key_views, extent, config, display_exposure)
+
+
+def over_border(setup: Setup, images: FrameImages) -> Setup:
+    """Return a setup without points with the colour of the images' borders as its background, with
+    a warning. If the borders have no colour in common, few cameras around a scene get the mean
+    colour of the images, and others nothing. With points or a background, the setup stays as it is.
+
+    Args:
+        setup: data that all frames share.
+        images: of the first frame, as for `observe_frame`.
+    """
+    render = setup.config.render
+    backgrounds = [render.background, *(camera.background for camera in setup.cameras)]
+    if any(b is not None for b in backgrounds) or has_points(setup.cameras, setup.points):
+        return setup
+    encoded = observe_frame(setup, 0, ImageHistory(), images).encoded
+    views = views_of(setup, encoded)
+    color = border_color(views)
+    source = "colour of the images' borders"
+    if color is None and are_around(setup.cameras):
+        color = mean_color(views)
+        source = "mean colour of the images"
+    if color is None:
+        return setup
+    _LOG.warning(
+        "no points: the background is the %s, %s; give a `RenderConfig.background` for another.",
+        source,
+        tuple(np.round(color, 3).tolist()),
+    )
+    render = replace(render, background=color)
+    return replace(setup, config=replace(setup.config, render=render))
 
 
 def views_of(setup: Setup, images: Images) -> list[View]:
     """Return the views that have an image."""
-    return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
+    return [setup.views[v].at(image) for v, image in images.items()]
 
 
 def observe_frame(
-    setup: Setup, frame: int, history: ImageHistory, images: Frame
+    setup: Setup, frame: int, history: ImageHistory, images: FrameImages
 ) -> FrameObservation:
     """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
@@ -141,29 +200,32 @@ def observe_frame(
         setup: data that all frames share.
         frame: its index.
         history: images up to the frame before; `ImageHistory()` for the first.
-        images: per training view uint8 [H, W, 3], RGB, or linear light (see `Frame`), or None
+        images: per training view uint8 [H, W, 3], RGB, or linear light (see `FrameImages`), or None
             where the view has no image. They are copied.
 
     Raises:
         ValueError: as for `copied_images`.
     """
-    recorded = copied_images(setup.cameras, images, frame, history.kind)
+    recorded = copied_images(setup.views, images, frame, history.kind)
     new_history, changes = _extended(setup, history, recorded)
-    flows, key_views = _flows(setup, frame, history.images, new_history.images, changes)
+    # Beside the search for the active Gaussians, which does not need it.
+    key_views = in_background(
+        partial(_key_views, setup, frame, history.images, new_history.images, changes)
+    )
     encoded = {
         v: new_history.images[v]
         if image.dtype == np.uint8
         else new_history.exposures.get(v, Exposure()).corrected(encode_light(image))
         for v, image in recorded.items()
     }
-    return FrameObservation(new_history, changes, flows, key_views, encoded, recorded)
+    return FrameObservation(new_history, changes, encoded, recorded, key_views)
 
 
 def extended_history(
-    setup: Setup, frame: int, history: ImageHistory, images: Frame
+    setup: Setup, frame: int, history: ImageHistory, images: FrameImages
 ) -> ImageHistory:
     """Return the images up to a frame, without flow; arguments and errors of `observe_frame`."""
-    return _extended(setup, history, copied_images(setup.cameras, images, frame, history.kind))[0]
+    return _extended(setup, history, copied_images(setup.views, images, frame, history.kind))[0]
 
 
 def _extended(
@@ -184,12 +246,15 @@ def _extended(
     exposures = {}
     if follow:
         # Relative to the views' first images, without the change of light that all views show.
-        view_exposures = map_in_threads(
-            lambda v: follow_exposure(
-                history.references[v], display_images[v], setup.masks[v], history.exposures.get(v)
+        pairs = map_in_threads(
+            lambda v: (
+                *reduced(history.references[v], display_images[v], setup.views[v].mask),
+                history.exposures.get(v),
             ),
             views,
         )
+        # A fit is many short operations, for which threads would only wait for each other.
+        view_exposures = [fit_exposure(*pair) for pair in pairs]
         light = common_change(view_exposures)
         relative = [exposure.without(light) for exposure in view_exposures]
         # The identity where an exposure hardly changes an image.
@@ -204,7 +269,7 @@ def _extended(
     references = {**history.references, **images}
     config = setup.config.motion.change
     masks = map_in_threads(
-        lambda v: change_mask(history.references[v], images[v], setup.masks[v], config), views
+        lambda v: change_mask(history.references[v], images[v], setup.views[v].mask, config), views
     )
     for v, mask in zip(views, masks, strict=True):
         changes[v] = mask
@@ -215,21 +280,21 @@ def _extended(
     return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
 
 
-def _flows(
+def _key_views(
     setup: Setup,
     frame: int,
     previous: Images,
     images: Images,
     changes: Mapping[int, np.ndarray] | None,
-) -> tuple[dict[int, FlowObservation], dict[int, KeyView]]:
-    """Return the optical flow of the key views that changed, with masks in every n-th frame, where
-    a term uses it.
+) -> dict[int, KeyView]:
+    """Return the key views that changed with their optical flow, and with masks in every n-th
+    frame, where a term uses it.
     """
     motion = setup.config.motion
     has_mask_loss = motion.learn_confidence and setup.config.fit.objective.mask_weight > 0
     with_masks = has_mask_loss and frame % motion.mask_interval == 0
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
-        return {}, {}
+        return {}
     common_views = sorted(previous.keys() & images.keys())
     key_views = [v for v in setup.key_views if v in common_views]
     if len(key_views) < len(setup.key_views) and common_views:  # others, where some lack an image
@@ -240,10 +305,10 @@ def _flows(
         box = None if changes is None else box_around(changes[v])
         if changes is None or box is not None:
             region = None if changes is None else moving_region(changes[v])
-            name = setup.cameras[v].name
-            pairs[v] = FramePair(images[v], previous[v], name, frame, setup.masks[v], box, region)
+            view = setup.views[v]
+            pairs[v] = FramePair(images[v], previous[v], view.name, frame, view.mask, box, region)
     if not pairs:
-        return {}, {}
+        return {}
     masks = motion.mask_method if with_masks else None
     flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
-    return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
+    return {v: KeyView(pairs[v], flow) for v, flow in flows.items()}

@@ -7,11 +7,9 @@ Presets:
                                       offset; with confidence
     paper                             all three modules; motion starts from zero instead of the
                                       lifted flow, one gate, constant learning rates
-    rigidity                          the baseline with the rigid neighbours of Dynamic 3D Gaussians
-                                      (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no
-preset. `core.config` reads settings from TOML files and writes them.
+preset. `platform.config` reads settings from TOML files and writes them.
 """
 
 from __future__ import annotations
@@ -19,12 +17,12 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.core.config import NonNegativeInt, apply_values, config_class
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.platform.config import NonNegativeInt, apply_values, config_class
 from morgs_mi.render.render_config import RenderConfig
 
-PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
+PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper"]
 
 
 @config_class
@@ -70,22 +68,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "two_gates": False,
             **_modules(True, True, True),
         },
-    },
-    "rigidity": {
-        "fit": {
-            "objective": {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2},
-            "density": {"later_frames": False},
-            "decay_means_rate": False,
-            "rates": {
-                "means": 4e-3,
-                "quats": 0.02,
-                "scales": 0.0,
-                "opacities": 0.0,
-                "sh_dc": 0.0,
-                "sh_rest": 0.0,
-            },
-        },
-        "motion": {"constant_velocity": True, **_modules(False, False, False)},
     },
 }
 

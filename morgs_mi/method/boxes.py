@@ -1,57 +1,89 @@
-"""Boxes of pixels around projected Gaussians, and the blocks of a view that they cover."""
+"""Boxes of pixels around projected Gaussians, and the blocks of the views that they cover.
+
+All views are computed together: a lane has one Gaussian in one view.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Float, UInt32
-from morgs_mi.render.backend import elements
-from morgs_mi.render.projection import project
-from morgs_mi.render.region import BlockGrid
+from morgs_mi.render.backend import block_shape, elements
+from morgs_mi.render.projection import TracedCameras, project
+from morgs_mi.render.region import BlockGrid, quotient, quotient_and_rest
 from morgs_mi.render.render_config import RenderConfig
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of N Gaussians in one view, in px; empty where a Gaussian is culled."""
+    """Boxes of N Gaussians in V views, view by view, in px; empty where a Gaussian is culled."""
 
-    left: UInt32  #: First column [N].
-    top: UInt32  #: First row [N].
-    right: UInt32  #: Column after the last one [N].
-    bottom: UInt32  #: Row after the last one [N].
+    grids: Sequence[BlockGrid]  #: All blocks of each view, of one shape.
+    left: UInt32  #: First column [V N].
+    top: UInt32  #: First row [V N].
+    right: UInt32  #: Column after the last one [V N].
+    bottom: UInt32  #: Row after the last one [V N].
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return dr.width(self.left) // len(self.grids)
 
     @property
     def area(self) -> Float:
-        """Number of pixels [N]."""
+        """Number of pixels [V N]."""
         return mi.Float((self.right - self.left) * (self.bottom - self.top))
 
-    def within(self, table: UInt32, grid: BlockGrid, factor: int = 1) -> Float:
-        """Return the number of pixels [N] of each box in some blocks of the view.
+    @property
+    def sides(self) -> np.ndarray:
+        """Width and height of a block of each view, px [V, 2]."""
+        return np.tile(self.grids[0].block, (len(self.grids), 1))
+
+    def of_view(self, index: int) -> Boxes:
+        """Return the boxes in one view."""
+        lane = dr.arange(mi.UInt32, self.count) + opaque(mi.UInt32, index * self.count)
+        sides = (self.left, self.top, self.right, self.bottom)
+        return Boxes([self.grids[index]], *(elements(side, lane) for side in sides))
+
+    def total(self, values: Float) -> Float:
+        """Return the sum of numbers [V N] over the views [N], in their order."""
+        lane = dr.arange(mi.UInt32, self.count)
+        count = opaque(mi.UInt32, self.count)
+        return sum(elements(values, lane + v * count) for v, _ in enumerate(self.grids))
+
+    def within(self, masks: np.ndarray, sides: np.ndarray) -> Float:
+        """Return the number of pixels [V N] of each box in some blocks of its view.
 
         The number of pixels before a corner is linear within a block, along x and y: it is
         interpolated.
 
         Args:
-            table: the `summed_area` of these blocks.
-            grid: all blocks of the view, at 1 / `factor` of its resolution.
-            factor: by which the view is reduced.
+            masks: these blocks, bool [V, rows, columns].
+            sides: width and height of a block of each view, px [V, 2].
         """
-        width, height = (factor * side for side in grid.block)
-        rows, columns = grid.shape
+        tables = np.pad(masks, ((0, 0), (1, 0), (1, 0))).cumsum(1).cumsum(2)
+        table = from_numpy(mi.UInt32, tables)
+        _, rows, columns = masks.shape
+        pitch = opaque(mi.UInt32, columns + 1)
+        view = quotient(dr.arange(mi.UInt32, dr.width(self.left)), self.count)
+        first = view * opaque(mi.UInt32, (rows + 1) * (columns + 1))
+        numbers = from_numpy(mi.Float, np.column_stack([1 / sides, sides.prod(axis=1)]))
+        per_width, per_height, area = (elements(numbers, 3 * view + k) for k in range(3))
 
         def before(x: UInt32, y: UInt32) -> Float:
-            across = mi.Float(x) * (1 / width)
-            down = mi.Float(y) * (1 / height)
-            i = dr.minimum(mi.UInt32(across), dr.opaque(mi.UInt32, columns - 1))
-            j = dr.minimum(mi.UInt32(down), dr.opaque(mi.UInt32, rows - 1))
-            place = j * dr.opaque(mi.UInt32, columns + 1) + i
-            pitch = dr.opaque(mi.UInt32, columns + 1)
+            across = mi.Float(x) * per_width
+            down = mi.Float(y) * per_height
+            i = dr.minimum(mi.UInt32(across), opaque(mi.UInt32, columns - 1))
+            j = dr.minimum(mi.UInt32(down), opaque(mi.UInt32, rows - 1))
+            place = first + j * pitch + i
             a, b, c, d = (
                 mi.Float(elements(table, place + step)) for step in (0, 1, pitch, pitch + 1)
             )
@@ -61,49 +93,57 @@ class Boxes:
 
         right = before(self.right, self.bottom) - before(self.right, self.top)
         left = before(self.left, self.bottom) - before(self.left, self.top)
-        return (right - left) * (width * height)
+        return (right - left) * area
 
-    def union(self, selection: np.ndarray, grid: BlockGrid) -> np.ndarray:
-        """Return the blocks, bool [rows, columns], that any box of a `selection` [N] touches."""
-        rows = np.flatnonzero(selection)
-        x0, y0, x1, y1 = (
-            np.asarray(v)[rows].astype(np.int64)
-            for v in (self.left, self.top, self.right, self.bottom)
-        )
-        some = (x1 > x0) & (y1 > y0)
-        width, height = grid.block
-        x0 = x0[some] // width
-        y0 = y0[some] // height
-        x1 = -(-x1[some] // width)
-        y1 = -(-y1[some] // height)
+    def union(self, selection: np.ndarray) -> np.ndarray:
+        """Return the blocks that any box of a `selection` touches, bool [V, rows, columns], with as
+        many rows and columns as the largest view (see `stacked`).
+
+        Args:
+            selection: which boxes, bool [N] or [V, N].
+        """
+        count = len(self.grids)
+        selected = from_numpy(mi.Bool, np.broadcast_to(selection, (count, self.count)).ravel())
+        some = selected & (self.right > self.left) & (self.bottom > self.top)
+        width, height = self.grids[0].block
+        x0 = self.left // width
+        y0 = self.top // height
+        x1 = (self.right + (width - 1)) // width
+        y1 = (self.bottom + (height - 1)) // height
         # Summed over rows and columns, steps at the four corners fill a rectangle.
-        rows, columns = (size + 1 for size in grid.shape)
-        corners = np.concatenate(
-            [y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0]
-        )
-        signs = np.repeat([1.0, -1.0], 2 * len(x0))
-        steps = np.bincount(corners, signs, rows * columns).reshape(rows, columns)
-        return (steps.cumsum(0).cumsum(1) > 0.5)[:-1, :-1]
+        rows, columns = np.max([grid.shape for grid in self.grids], axis=0).tolist()
+        steps = dr.zeros(mi.Int32, count * (rows + 1) * (columns + 1))
+        view = quotient(dr.arange(mi.UInt32, dr.width(self.left)), self.count)
+        first = view * opaque(mi.UInt32, rows + 1)
+        pitch = opaque(mi.UInt32, columns + 1)
+        for x, y, step in ((x0, y0, 1), (x1, y1, 1), (x1, y0, -1), (x0, y1, -1)):
+            dr.scatter_add(steps, mi.Int32(step), (first + y) * pitch + x, some)
+        numbers = np.asarray(steps).reshape(count, rows + 1, columns + 1)
+        return numbers.cumsum(1).cumsum(2)[:, :-1, :-1] > 0
 
 
-def boxes_around(gaussians: Gaussians, camera: Camera, render: RenderConfig, core: float) -> Boxes:
-    """Return the boxes around Gaussians in a view.
+def boxes_around(
+    gaussians: Gaussians, cameras: Sequence[Camera], render: RenderConfig, core: float
+) -> Boxes:
+    """Return the boxes around Gaussians in some views.
 
     Args:
-        gaussians: N Gaussians.
-        camera: the view.
+        gaussians: N >= 1 Gaussians.
+        cameras: the views, at least one.
         render: cut-offs.
         core: half side of a box, as a fraction of the Gaussian's extent.
     """
+    count = len(gaussians)
     with dr.suspend_grad():
-        splats = project(gaussians, camera, (), render)
-        corners = []
-        for axis, size in ((0, camera.width), (1, camera.height)):
-            center = splats.shape[axis]
-            half = core * splats.extent[axis]
-            low = dr.clip(dr.floor(center - half), 0, dr.opaque(mi.Float, size))
-            high = dr.clip(dr.floor(center + half) + 1, 0, dr.opaque(mi.Float, size))
-            corners.append((mi.UInt32(low), mi.UInt32(dr.select(splats.valid, high, low))))
-        (left, right), (top, bottom) = corners
-        dr.eval(left, top, right, bottom)
-    return Boxes(left, top, right, bottom)
+        view, row = quotient_and_rest(dr.arange(mi.UInt32, len(cameras) * count), count)
+        splats = project(gaussians, TracedCameras.of(cameras).of_each(view), (), render, row)
+        sides = from_numpy(mi.Float, [camera.size for camera in cameras])
+        size = mi.Point2f(elements(sides, 2 * view), elements(sides, 2 * view + 1))
+        half = core * splats.radius
+        low = dr.clip(dr.floor(splats.mean - half), 0, size)
+        high = dr.clip(dr.floor(splats.mean + half) + 1, 0, size)
+        first = mi.Point2u(low)
+        end = mi.Point2u(dr.select(splats.valid, high, low))
+        dr.eval(first, end)
+    grids = [BlockGrid(*camera.size, block_shape(render)) for camera in cameras]
+    return Boxes(grids, first.x, first.y, end.x, end.y)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from morgs_mi.core.config import NonNegative, config_class
+from morgs_mi.platform.config import NonNegative, config_class
 
 # Of 1; also the least threshold, and the bound of the noise of the whole image.
 _GREY_LEVEL = 1 / 255

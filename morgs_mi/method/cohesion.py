@@ -1,20 +1,19 @@
-"""Cohesion: neighbours of similar colour are parts of one object, and move or stand still together.
+"""Cohesion: neighbours are parts of one object, and move or stand still together.
 
 Flow is unreliable evidence of motion. It is zero inside an object with weak texture, it bleeds onto
 the background beside the object, and shadows have flow, too. But objects are mostly separate from
-their surroundings in space or in colour. So the logit u_i of the confidence of each active Gaussian
-is replaced by z_i, an approximate solution of
+their surroundings. So the logit u_i of the confidence of each active Gaussian is replaced by z_i,
+an approximate solution of
 
-    z_i = (u_i + lambda sum_j a_ij z_j) / (1 + lambda sum_j a_ij),
-    a_ij = o_j exp(-|c_i - c_j|^2 / (2 s^2)),
+    z_i = (u_i + lambda sum_j o_j z_j) / (1 + lambda sum_j o_j),
 
-over its nearest neighbours j, where o is opacity and c is chromaticity, which shadows hardly
-change. All other Gaussians stand still. (A random walk on the graph of neighbours; Grady 2006
-segments images so.)
+over its nearest neighbours j, where o is opacity. All other Gaussians stand still. (A random walk
+on the graph of neighbours; Grady 2006 segments images so.)
 
-A Gaussian that resembles none of its neighbours follows its own evidence, and one that is
-transparent does not pull others along: such Gaussians gather over many frames, and all of them seem
-to stand still.
+A Gaussian that is transparent does not pull others along: such Gaussians gather over many frames,
+and all of them seem to stand still.
+
+It saves bytes: without it, later frames have 14 % more on basketball and 19 % more on walk4.
 """
 
 from __future__ import annotations
@@ -23,15 +22,10 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
-# Of 1: the chromaticity of darker colours is noise.
-_LEAST_COLOR = 0.02
 # Number of nearest Gaussians: more of them would pull along thin objects of few Gaussians.
 _NEIGHBOURS = 12
-# Difference of chromaticity s at which the affinity has fallen to 0.61.
-_CHROMA_SCALE = 0.03
 # Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads
 # farther.
 ROUNDS = 150
@@ -86,18 +80,13 @@ def share_confidence(
         indices: int [M], indices of the active ones.
         logit: u [M], their own logits.
         still: logit of all others.
-        weight: lambda, of an opaque neighbour of the same colour; 0: no cohesion.
+        weight: lambda, of an opaque neighbour; 0: no cohesion.
         neighbours: index of all means.
     """
     near = neighbours.nearest(_NEIGHBOURS, indices)
     if not near.size:
         return logit
-    # Colours without view-dependence, each divided by its sum.
-    color = np.maximum(0.5 + SH_C0 * np.asarray(gaussians.sh_coeffs)[:, 0], _LEAST_COLOR)
-    chroma = color / color.sum(axis=1, keepdims=True)
-    square = np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2)
-    likeness = np.asarray(gaussians.opacities)[near] * np.exp(-square / (2 * _CHROMA_SCALE**2))
-    affinity = weight * likeness.astype(np.float32)
+    affinity = np.float32(weight) * np.asarray(gaussians.opacities)[near]
     starts = np.arange(0, near.size + 1, near.shape[1])
     weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(indices), len(gaussians)))
     total = 1 + affinity.sum(axis=1)

@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from morgs_mi.core.checks import valid_pixels
-from morgs_mi.core.config import config_or_default
-from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
@@ -21,6 +18,9 @@ from morgs_mi.method.flow_sources.flow_registry import (
     FramePair,
 )
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
+from morgs_mi.platform.checks import valid_pixels
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.threads import map_in_threads
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,15 +17,12 @@ point tracks and triangulates these.)
 Flow bleeds over the edges of moving objects, in each view onto another part of the static
 background. So a view's weight follows its agreement with the others, k_iv = 1 / (1 + |u_iv - J_v
 d_i|^2 / s_iv^2) with s_iv = 0.2 px + |J_v d_i| / 5, by iteratively reweighted least squares
-(Cauchy's cost r(e) = log(1 + |e|^2 / s^2)). There and below, |e|^2 is the mean over the Gaussian's
-pixels, that is, the squared length plus the variance of the flow: on a rigid part the flow hardly
-varies; where it bleeds, it falls off. Motion is separated from noise by how much better it explains
-the flow than no motion does,
+(Cauchy's cost r(e) = log(1 + |e|^2 / s^2)). Motion is separated from noise by how much better it
+explains the flow than no motion does,
 
     e_i = sum_v a_iv (r(u_iv) - r(u_iv - J_v d_i)) / sum_v a_iv,    a_iv = W_iv / (W_iv + 1),
 
-the mean over the key views that see the Gaussian: it moves if e_i > 0.5 and its motion exceeds the
-noise of the flow in some view.
+the mean over the key views that see the Gaussian: it moves if e_i > 0.5.
 """
 
 from __future__ import annotations
@@ -37,16 +34,14 @@ from functools import cached_property
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView, ViewGroup
 
 # Numbers of a pixel that are summed per Gaussian.
-_FLOW_MAPS = 4
+_FLOW_MAPS = 3
 # Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is
 # hardly visible stays in place.
 _PRIOR_PIXELS = 0.3
@@ -60,10 +55,10 @@ _HALF_WEIGHT_PIXELS = 1.0
 _NOISE_PX = 0.2
 # Evidence e_i above which a Gaussian moves.
 _MIN_EVIDENCE = 0.5
-# Logit of the confidence per unit of evidence above `_MIN_EVIDENCE`.
-_CONFIDENCE_SLOPE = 4.0
-MAX_LOGIT = 2.0
-"""Bound of the logit of the confidence: 0.12 to 0.88, soft enough for the images to correct it."""
+LOGIT = 2.0
+"""Logit of the confidence of a Gaussian that moves, 0.88, and negative of one that does not: soft
+enough for the images to correct it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +67,7 @@ class _Flows:
 
     weight: np.ndarray  # W [V, N]
     flow: np.ndarray  # u [V, N, 2], px
-    variance: np.ndarray  # of the flow over the pixels of the Gaussian [V, N], px^2
     jacobian: np.ndarray  # J [V, N, 2, 3], px per world unit
-    floor: np.ndarray  # of the motion [V, 1], px
 
     @cached_property
     def squares(self) -> np.ndarray:
@@ -90,16 +83,13 @@ class _Flows:
         [V, N, 2] in px.
         """
         scale = _NOISE_PX + _NOISE_FRACTION * np.linalg.norm(motion, axis=-1)
-        return np.log1p(
-            (np.sum((self.flow - self.project(d)) ** 2, axis=-1) + self.variance) / scale**2
-        )
+        return np.log1p(np.sum((self.flow - self.project(d)) ** 2, axis=-1) / scale**2)
 
 
 def lift_flow(
     gaussians: Gaussians,
     views: Mapping[int, ActiveView],
     observations: Mapping[int, FlowObservation],
-    masks: MaskConfig | None = None,
 ) -> MotionStart:
     """Return the displacements that explain the flow of the key views best, and the confidence that
     follows from it.
@@ -109,52 +99,42 @@ def lift_flow(
         views: active views, by view index.
         observations: flow of the key views, by view index; those without an active view are not
             used.
-        masks: settings of the motion masks; their floor is the noise of the flow.
     """
     indices = sorted(observations.keys() & views.keys())
     if not indices:
         N = len(gaussians)
-        logit = np.full(N, -MAX_LOGIT, np.float32)
-        return MotionStart(np.zeros((N, 3), np.float32), logit)
+        return MotionStart(np.zeros((N, 3), np.float32), np.full(N, -LOGIT, np.float32))
     group = ViewGroup([views[v] for v in indices])
     flow = group.crop([observations[v].forward_flow for v in indices])
     reliable = group.crop([observations[v].forward_reliable for v in indices])
-    # u, |u|^2 and 1 where the flow u is reliable; 0 elsewhere.
+    # u and 1 where the flow u is reliable; 0 elsewhere.
     maps = np.empty((*reliable.shape, _FLOW_MAPS), np.float32)
     maps[..., :2] = flow
-    maps[..., 2] = np.sum(flow**2, axis=-1)
-    maps[..., 3] = 1
+    maps[..., 2] = 1
     maps *= reliable[..., None]
     sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
-    average = sums[..., :3] / np.maximum(sums[..., 3:], 1e-6)
-    means = gaussians.numpy()["means"].astype(np.float64)
-    cameras = [view.camera for view in group.views]
+    means = np.asarray(gaussians.means, np.float64)
     flows = _Flows(
-        sums[..., 3],
-        average[..., :2],
-        np.maximum(average[..., 2] - np.sum(average[..., :2] ** 2, axis=-1), 0),
-        np.stack([camera.projection_jacobian(means) for camera in cameras]),
-        np.array([[motion_floor(camera.width, masks or MaskConfig())] for camera in cameras]),
+        sums[..., 2],
+        sums[..., :2] / np.maximum(sums[..., 2:], 1e-6),
+        np.stack([view.camera.projection_jacobian(means) for view in group.views]),
     )
     d = _solve(flows, np.ones_like(flows.weight))
     for _ in range(_ROUNDS):  # iteratively reweighted least squares
         d = _solve(flows, np.exp(-flows.cost(d, flows.project(d))))
-    logit = _logits(flows, d)
+    moves = _evidence(flows, d) > _MIN_EVIDENCE
     return MotionStart(
-        np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
+        np.where(moves[:, None], d, 0).astype(np.float32),
+        np.where(moves, LOGIT, -LOGIT).astype(np.float32),
     )
 
 
-def _logits(flows: _Flows, d: np.ndarray) -> np.ndarray:
-    """Return the logits [N] of the confidence that Gaussians move by d [N, 3]: from the evidence e,
-    by which d explains the flow better than no motion does.
-    """
+def _evidence(flows: _Flows, d: np.ndarray) -> np.ndarray:
+    """Return the evidence e [N]: how much better d [N, 3] explains the flow than no motion does."""
     motion = flows.project(d)
     a = flows.weight / (flows.weight + _HALF_WEIGHT_PIXELS)
-    gain = (a * (flows.cost(np.zeros_like(d), motion) - flows.cost(d, motion))).sum(axis=0)
-    logit = _CONFIDENCE_SLOPE * (gain / a.sum(axis=0, initial=1e-6) - _MIN_EVIDENCE)
-    is_visible = np.any(np.linalg.norm(motion, axis=-1) > flows.floor, axis=0)
-    return np.where(is_visible, np.clip(logit, -MAX_LOGIT, MAX_LOGIT), -MAX_LOGIT)
+    gain = flows.cost(np.zeros_like(d), motion) - flows.cost(d, motion)
+    return (a * gain).sum(axis=0) / a.sum(axis=0, initial=1e-6)
 
 
 def _solve(flows: _Flows, trust: np.ndarray) -> np.ndarray:

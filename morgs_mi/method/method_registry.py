@@ -8,7 +8,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Generic, TypeVar
 
-from morgs_mi.core.extras import extra_function, places
+from morgs_mi.platform.extras import extra_function, places
 
 Made = TypeVar("Made")
 Config = TypeVar("Config")

@@ -4,14 +4,13 @@ refinement.
 A stage returns a better start from the one before. `STARTS` has them in their order, by the
 settings that switch them off.
 
-Motion proposals from the previous frame and from neighbours, where lifted flow fails.
+Motion proposals from neighbours, where lifted flow fails.
 
-Flow fails where parts are thin and fast, or look alike. But motion mostly continues, and neighbours
-share it. So each Gaussian gets further proposals, as pixels do in PatchMatch (Barnes et al. 2009):
-first its own motion of the previous frame, then, in each round, the motion of a random one of its
-nearest moving neighbours. All Gaussians try their proposals at once and are rendered in the key
-views. With the attributed error E_iv and the coverage W_iv there (see `error_per_gaussian`), the
-error of a Gaussian is
+Flow fails where parts are thin and fast, or look alike. But neighbours share their motion. So in
+each round, a Gaussian gets the motion of a random one of its nearest moving neighbours as a
+proposal, as pixels do in PatchMatch (Barnes et al. 2009). All Gaussians try their proposals at once
+and are rendered in the key views. With the attributed error E_iv and the coverage W_iv there (see
+`error_per_gaussian`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
@@ -53,11 +52,11 @@ from morgs_mi.core.types import Arrays
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.lift import MAX_LOGIT, lift_flow
+from morgs_mi.method.lift import LOGIT, lift_flow
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.search import search_motion
-from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import relative_error
 
 # Nearest Gaussians. Their pixels count, too, if they move: a small Gaussian alone may cover one
@@ -127,7 +126,7 @@ def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarr
     return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]
 
 
-# Rounds of proposals from neighbours, after the one from the previous frame.
+# Rounds of proposals.
 _ROUNDS = 2
 # Nearest Gaussians that a proposal is drawn from.
 _NEIGHBOURS = 8
@@ -149,31 +148,22 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """
     d = start.displacement  # [N, 3]
     logit = start.logit_confidence
-    # Into the previous frame, of those that moved then with confidence.
-    gaussians = problem.gaussians
-    last_motion = np.zeros_like(d) if gaussians.motion is None else np.asarray(gaussians.motion)
-    if gaussians.logit_confidence is not None:
-        last_motion = np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, last_motion, 0)
-    if not (d.any() or last_motion.any()):
-        return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
-    rounds = _ROUNDS if near.size else 0
-    reached = np.asarray(d.any(axis=1) | last_motion.any(axis=1))
-    for _ in range(rounds):  # those that may move within these rounds
+    if not (d.any() and near.size):
+        return start
+    reached = np.asarray(d.any(axis=1))
+    for _ in range(_ROUNDS):  # those that may move within these rounds
         reached = np.logical_or(reached, reached[near].any(axis=1))
-    images = problem.images_around(reached, (d, last_motion))
+    images = problem.images_around(reached, (d,))
     if images is None:
         return start
     names = ("error", "weight")
     error = relative_error(images.sums(displaced(problem.gaussians, d), names))
-    for k in range(1 + rounds):
+    for _ in range(_ROUNDS):
         moves = np.asarray(d.any(axis=1))
-        if k:
-            # A random neighbour of each Gaussian, a moving one if there is any.
-            draw = moves[near] + problem.rng.random(near.shape, np.float32)
-            proposal = d[near[np.arange(len(near)), draw.argmax(axis=1)]]
-        else:
-            proposal = np.where(np.any(last_motion, axis=1, keepdims=True), last_motion, d)
+        # A random neighbour of each Gaussian, a moving one if there is any.
+        draw = moves[near] + problem.rng.random(near.shape, np.float32)
+        proposal = d[near[np.arange(len(near)), draw.argmax(axis=1)]]
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue
@@ -188,22 +178,18 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
 
 
 STARTS: dict[str, Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]] = {
-    "lift_flow": lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows, config.masks),
+    "lift_flow": lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows),
     "propagate_motion": lambda p, start, config: propagate_motion(p, start),
     "search_motion": lambda p, start, config: search_motion(p, start, config.search),
     "refine_start": lambda p, start, config: refine_start(p, start) if config.two_gates else start,
 }
 
-# Logit that a confidence loses per frame without evidence of motion: where something moved, more is
-# to correct.
-_CONFIDENCE_DECAY = 0.3
-
 
 def initial_motion(
     previous: Gaussians,
     active: ActiveSet,
+    views: Mapping[int, ObservedView],
     flows: Mapping[int, FlowObservation],
-    targets: Mapping[int, Target],
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> MotionStart | None:
@@ -213,13 +199,13 @@ def initial_motion(
 
     Args:
         previous: N Gaussians of the previous frame, detached.
-        active: the M active ones, and the active views.
+        active: the M active ones.
+        views: the active views with their images, by view index.
         flows: optical flow of the key views, by view index.
-        targets: images of the active views, by view index.
         config: which modules are on.
         rng: draws the neighbours that proposals come from.
     """
-    if not (active.views and len(active.indices)):
+    if not (views and len(active.indices)):
         return None
     gaussians = active.select(previous)
     start = MotionStart.without_motion(gaussians)
@@ -227,21 +213,18 @@ def initial_motion(
         if not config.constant_velocity or gaussians.motion is None:
             return start if config.constant_velocity else None
         return replace(start, displacement=np.asarray(gaussians.motion))
-    views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
-    problem = MotionProblem(gaussians, views, targets, rng, flows)
+    key_views = {v: views[v] for v in sorted(flows.keys() & views.keys())}
+    problem = MotionProblem(gaussians, key_views, rng, flows)
     for name, stage in STARTS.items():
         if getattr(config, name):
             start = stage(problem, start, config)
-        if not views:  # lifted flow alone has a start: no motion
+        if not key_views:  # lifted flow alone has a start: no motion
             break
-    logit = start.logit_confidence
-    if gaussians.logit_confidence is not None:
-        last_logit = np.asarray(gaussians.logit_confidence)
-        logit = np.maximum(logit, last_logit - np.float32(_CONFIDENCE_DECAY))
     neighbours = problem.neighbours
     if gaussians is not previous:
         neighbours = NeighbourIndex(np.asarray(previous.means))
+    logit = start.logit_confidence
     shared = share_confidence(
-        previous, active.indices, logit, -MAX_LOGIT, config.cohesion_weight, neighbours
+        previous, active.indices, logit, -LOGIT, config.cohesion_weight, neighbours
     )
     return replace(start, logit_confidence=shared)

@@ -6,13 +6,13 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from morgs_mi.core.config import Count, NonNegative, config_class
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
+from morgs_mi.platform.config import Count, NonNegative, config_class
 
 
 @config_class
@@ -40,7 +40,7 @@ class MotionConfig:
     constant_velocity: bool = False
     """Without lifted flow: start each Gaussian's motion from its motion in the previous frame."""
     propagate_motion: bool = True
-    """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
+    """Also try the motion of neighbours as starts; needs `lift_flow`."""
     search_motion: bool = True
     """Search for parts that neither flow nor proposals explain; needs `lift_flow`."""
     refine_start: bool = True
@@ -48,23 +48,21 @@ class MotionConfig:
     `two_gates`.
     """
     lift_confidence: bool = True
-    """Raise each Gaussian's confidence to the confidence of lifted flow; False: carry it over, as
-    in the paper.
-    """
+    """Start each Gaussian's confidence from lifted flow; False: carry it over, as in the paper."""
     flow_method: str = "dis"
     """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for
     a network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of
     bytes)."""
     mask_method: str = "grabcut"
-    """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
-    sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
-    key_views: Count = 4
-    """Number of cameras with optical flow and masks."""
+    """Refinement of flow masks to objects: none, grabcut, or sam2:ENCODER.onnx,DECODER.onnx
+    (see docs/masks.md)."""
+    key_views: Count | tuple[str, ...] = 4
+    """Number of cameras with optical flow and masks, or their names."""
     mask_interval: Count = 5
     """Frames from one supervision of the confidence by masks to the next."""
     cohesion_weight: NonNegative = 50.0
-    """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian
-    alone (see `cohesion`); 0: no cohesion."""
+    """Weight of an opaque neighbour against the evidence of motion of a Gaussian alone (see
+    `cohesion`); 0: no cohesion."""
     model: str = "none"
     """Motion that Gaussians share, fitted before the residual: none, or a registered model (see
     docs/extending.md).

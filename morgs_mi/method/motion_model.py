@@ -25,8 +25,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array
 
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor, Tensors
 from morgs_mi.method.method_registry import Registry
 

@@ -14,9 +14,8 @@ from morgs_mi.core.types import Arrays
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.ssim import Target
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.sweep import MAPS, KeyImages
-from morgs_mi.render.active_view import ActiveView
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +45,7 @@ class MotionProblem:
 
     #: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame.
     gaussians: Gaussians
-    views: Mapping[int, ActiveView]  #: Active views, by view index.
-    targets: Mapping[int, Target]  #: Images of these views, by view index.
+    views: Mapping[int, ObservedView]  #: Active views with their images, by view index.
     rng: np.random.Generator  #: Draws the neighbours that proposals come from.
     #: Optical flow of the views, by view index.
     flows: Mapping[int, FlowObservation] = field(default_factory=dict)
@@ -61,7 +59,7 @@ class MotionProblem:
     @cached_property
     def images(self) -> KeyImages:
         """The images of all views, at least one."""
-        return KeyImages(self.views, self.targets)
+        return KeyImages(self.views)
 
     def sums_at(self, displacement: np.ndarray) -> Arrays:
         """Return the sums of all maps of a sweep, with the Gaussians displaced by d [N, 3]; kept
@@ -84,12 +82,14 @@ class MotionProblem:
         """
         some = self.gaussians.select(np.flatnonzero(selection))
         places = [some, *(displaced(some, d[selection]) for d in displacements if d.any())]
+        config = next(iter(self.views.values())).config
+        cameras = [view.camera for view in self.views.values()]
+        every = np.ones(len(some), bool)
+        reached = [boxes_around(place, cameras, config, 1.0).union(every) for place in places]
         views = {}
-        for index, view in self.views.items():
-            boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-            every = np.ones(len(some), bool)
-            blocks = np.any([box.union(every, view.grid) for box in boxes], axis=0)
-            narrow_view = view.narrowed(blocks)
+        for (index, view), blocks in zip(self.views.items(), np.any(reached, axis=0), strict=True):
+            rows, columns = view.grid.shape
+            narrow_view = view.narrowed(blocks[:rows, :columns])
             if narrow_view is not None:
                 views[index] = narrow_view
-        return KeyImages(views, self.targets) if views else None
+        return KeyImages(views) if views else None

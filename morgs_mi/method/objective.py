@@ -4,10 +4,9 @@ A `Term` declares its weight, the channels that must be rendered for it, and the
 it compares them with. Which channels a view renders, which static splats it needs and which losses
 a report lists follow from `TERMS`.
 
-An observation is an array of one view at one frame, by name. `target` exists in all views, and so
-do `neighbours`, the Gaussians of the previous frame, where a term compares them. The others exist
-in key views, where the observer of a term returns them. A term acts in the views that have all its
-observations.
+An observation is an array of one view at one frame, by name. `target` exists in all views. The
+others exist in key views, where the observer of a term returns them. A term acts in the views that
+have all its observations.
 
 `loss_term` registers further terms, which `ObjectiveConfig.terms` selects.
 
@@ -27,23 +26,25 @@ import drjit as dr
 import mitsuba as mi
 from annotated_types import Ge, Le
 
-from morgs_mi.core.checks import check_number
-from morgs_mi.core.config import NonNegative, config_class
 from morgs_mi.core.gaussians import Gaussians, read_columns
-from morgs_mi.core.types import Arrays, Tensor, Tensors
+from morgs_mi.core.types import Arrays, Float, Tensor, Tensors
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.method_registry import Registry
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.rigidity import isometry_loss, rigid_loss, rotation_loss
-from morgs_mi.method.ssim import Recon, Target
+from morgs_mi.method.ssim import Comparison, Recon, Target
+from morgs_mi.platform.checks import check_number
+from morgs_mi.platform.config import NonNegative, config_class
 from morgs_mi.render.backend import elements
 from morgs_mi.render.rasterize import Image
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import DrawnBlocks, Region
 
 
 def recon_loss(
-    image: Tensor, target: Target, dssim_weight: float, region: Region | None = None
+    image: Tensor,
+    target: Target | Comparison,
+    dssim_weight: float,
+    region: DrawnBlocks | None = None,
 ) -> Tensor:
     """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image`.
 
@@ -57,11 +58,15 @@ def recon_loss(
             equals the whole view's. The value omits pixels outside the region and SSIM windows
             without pixels inside, because they cannot have changed.
     """
-    part = None if region is None or region.whole else region
-    return dr.custom(Recon, image.array, target, dssim_weight, part)
+    on = target.comparison(region if isinstance(region, Region) and not region.whole else None)
+    loss = dr.custom(Recon, image.array, on, dssim_weight)
+    target.mse = on.mse
+    return loss
 
 
-def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int) -> Tensor:
+def flow_loss(
+    motion: Tensor, target: Tensor, reliable: Tensor, pixel_share: float | Float
+) -> Tensor:
     """Return the mean endpoint error in px between the rendered motion map and the observed motion
     (eq. 7).
 
@@ -70,7 +75,7 @@ def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int)
         target: motion by optical flow on the same grid, of the same shape and sign, px.
         reliable: [H, W] of 0 and 1, or on the region. The mean is over all pixels: few reliable
             pixels weigh little.
-        num_pixels: of the whole view.
+        pixel_share: weight of a pixel in a mean, 1 / the number of pixels of the whole view.
     """
     lane = dr.arange(mi.UInt32, dr.width(motion) // 2)
     x, y = (
@@ -79,25 +84,24 @@ def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int)
     )
     # A hundredth of a pixel keeps the derivative finite where both agree.
     total = dr.sum(dr.sqrt(x * x + y * y + 1e-4) * reliable.array)
-    return total * dr.opaque(mi.Float, 1 / num_pixels)
+    return total * pixel_share
 
 
-def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int) -> Tensor:
+def mask_loss(confidence: Tensor, mask: Tensor, pixel_share: float | Float) -> Tensor:
     """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W]
     (eq. 11), as `flow_loss`.
     """
-    return dr.sum(dr.abs(confidence.array - mask.array)) * dr.opaque(mi.Float, 1 / num_pixels)
+    return dr.sum(dr.abs(confidence.array - mask.array)) * pixel_share
 
 
-def offset_loss(offset: Tensor, extent: float, num_gaussians: int) -> Tensor:
+def offset_loss(offset: Tensor, share: float | Float) -> Tensor:
     """Return the mean L1 norm of the offsets [N, 3] in scene extents (L_off).
 
     Args:
         offset: offsets of the active Gaussians, world units.
-        extent: of the scene, world units.
-        num_gaussians: of the whole scene.
+        share: weight of an offset, 1 / (number of Gaussians of the whole scene * its extent).
     """
-    return dr.sum(dr.abs(offset.array)) * dr.opaque(mi.Float, 1 / (num_gaussians * extent))
+    return dr.sum(dr.abs(offset.array)) * share
 
 
 SQUARED_ERROR = "mse"
@@ -123,12 +127,6 @@ class ObjectiveConfig:
     """lambda_mask of eq. 13."""
     offset_weight: NonNegative = 0.01
     """lambda_off of eq. 13, per scene extent."""
-    rigid_weight: NonNegative = 0.0
-    """Weight of the local rigidity (see `rigidity`), per scene extent."""
-    rotation_weight: NonNegative = 0.0
-    """Weight of the similarity of rotations there."""
-    isometry_weight: NonNegative = 0.0
-    """Weight of the isometry there, per scene extent."""
     terms: tuple[str, ...] = ()
     """Registered terms, NAME:WEIGHT each (see docs/extending.md)."""
 
@@ -157,11 +155,14 @@ class Prediction:
 
     image: Image  #: The rendered channels.
     parameters: Tensors  #: Of the residual, by name.
-    region: Region | None  #: The rendered blocks; None: the whole view.
-    num_pixels: int  #: Of the whole view.
-    num_gaussians: int  #: Of the whole scene.
-    extent: float  #: Of the scene, world units.
+    region: DrawnBlocks | None  #: The rendered blocks; None: the whole view.
+    pixel_share: Float  #: Weight of a pixel in a mean: 1 / the number of the whole view's [1].
+    offset_share: Float  #: Weight of an offset, see `offset_loss` [1].
+    extent: float  #: Of the scene, world units; 1 in a recording, which has no further terms.
     gaussians: Gaussians  #: The active ones, after the residual.
+    #: The same ones in the previous frame, detached, in their order: one object in all steps up to
+    #: the round of density control.
+    previous: Gaussians
 
 
 Loss = Callable[[Prediction, Observations, ObjectiveConfig], Tensor]
@@ -193,7 +194,7 @@ TERMS: tuple[Term, ...] = (
     Term(  # eq. 7
         "flow",
         lambda p, o, config: flow_loss(
-            p.image["guided_motion"], o["motion"], o["reliable"], p.num_pixels
+            p.image["guided_motion"], o["motion"], o["reliable"], p.pixel_share
         ),
         channels=("guided_motion",),
         observations=("motion", "reliable"),
@@ -205,7 +206,7 @@ TERMS: tuple[Term, ...] = (
     ),
     Term(  # eq. 11
         "mask",
-        lambda p, o, config: mask_loss(p.image.confidence, o["mask"], p.num_pixels),
+        lambda p, o, config: mask_loss(p.image.confidence, o["mask"], p.pixel_share),
         channels=("confidence",),
         observations=("mask",),
         observer=lambda view, motion, config: (
@@ -216,20 +217,8 @@ TERMS: tuple[Term, ...] = (
     ),
     Term(  # L_off
         "offset",
-        lambda p, o, config: offset_loss(p.parameters["offset"], p.extent, p.num_gaussians),
+        lambda p, o, config: offset_loss(p.parameters["offset"], p.offset_share),
         parameters=("offset",),
-    ),
-    *(
-        Term(  # not in the paper, see `rigidity`
-            name,
-            lambda p, o, config, loss=loss: loss(p.gaussians, o["neighbours"]),
-            observations=("neighbours",),
-        )
-        for name, loss in (
-            ("rigid", rigid_loss),
-            ("rotation", rotation_loss),
-            ("isometry", isometry_loss),
-        )
     ),
 )
 

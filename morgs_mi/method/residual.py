@@ -17,9 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor, Tensors
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
@@ -98,6 +98,7 @@ def apply_residual(previous: Gaussians, parameters: Tensors, config: MotionConfi
         "motion": displacement,
         "offset": offset,
     }
+    dr.schedule(values)  # one kernel for all of a size
     return previous.with_parameters(
         values if logit is None else {**values, "logit_confidence": logit}
     )

@@ -22,16 +22,16 @@ memory.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.checks import valid_pixels
-from morgs_mi.core.memory import from_numpy, owned_copy
-from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
+from morgs_mi.core.arrays import from_numpy, opaque, owned_copy
+from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.method.ssim_layout import (
     COLUMN,
     RADIUS,
@@ -42,9 +42,10 @@ from morgs_mi.method.ssim_layout import (
     read_packet,
     write_packet,
 )
+from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.render.backend import elements, on_aligned_stack
 from morgs_mi.render.kernel_recording import recorded
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import DrawnBlocks, Region
 
 _Rows = list[list[Float]]  # a row of pixels of each plane
 _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
@@ -55,16 +56,98 @@ _TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
 
 
-@dataclass(frozen=True, eq=False)
-class _Windows:
-    """The windows that pixels of a region lie in, and the target's statistics there."""
+class Comparison:
+    """A target on a region, or on the whole view, and all that an image there is compared by.
 
-    windows: Lanes  # runs of the centres of the windows
-    count: int  # of the windows, one for each colour
-    pixels: Lanes  # runs of the pixels
-    num_valid: int  # of the pixels, one for each colour
-    mean: Float  # planes of M y, defined on `windows`
-    variance: Float  # planes of M yy - (M y)^2, likewise
+    Not a dataclass: `dr.custom` copies those.
+
+    Attributes:
+        planes: the layout of the images.
+        pixels: planes of the target.
+        region: the pixels that are compared; None: a whole view.
+        runs: of ``windows``, of the pixels (``lanes``) and, on a region, ``around`` it.
+        windows: runs of the centres of the windows that pixels of the region lie in.
+        mean: planes of M y, defined on `windows`.
+        variance: planes of M yy - (M y)^2, likewise.
+        count: number of the windows, one for each colour.
+        valid_share: inverse of the number of valid pixels, one for each colour.
+        scale: inverse of the number of the view's pixels, one for each colour.
+        height: of the view.
+        surroundings: planes in which the image replaces the pixels of the region, the target
+            elsewhere; None: it is a whole view's, or its planes are new each time.
+        around: runs of all pixels around the region that the windows read, which new planes have
+            of the target.
+        weight: planes, 0 where the target is masked; None: it is valid everywhere.
+        mse: mean squared error of the image that was compared last, over the valid pixels.
+    """
+
+    region: DrawnBlocks | None = None
+    runs: Mapping[str, Arrays]
+    windows: Lanes
+    mean: Float
+    variance: Float
+    count: float | Float
+    valid_share: float | Float
+    scale: float | Float
+    height: int | Int32
+    surroundings: Float | None = None
+    around: Lanes | None = None
+    weight: Float | None = None
+    mse: Float
+
+    def __init__(self, planes: Planes, pixels: Float, **numbers: Any) -> None:
+        self.planes = planes
+        self.pixels = pixels
+        vars(self).update(numbers)
+
+    @cached_property
+    def lanes(self) -> Lanes:
+        """Runs of the pixels; the argument's, if there is one."""
+        return Lanes.of(self.runs["lanes"])
+
+    @cached_property
+    def _places(self) -> tuple[UInt32, Bool]:
+        """Places of the numbers of an image on the region, and the mask of those in the view."""
+        assert self.region is not None
+        return self.planes.places_on(self.region)
+
+    @property
+    def on_region(self) -> tuple[Float, Float | None]:
+        """The target on the region, flat, 0 outside the view, and the weights of its numbers; None:
+        1.
+        """
+        return _on(self, self.region)
+
+    def comparison(self, region: object) -> Comparison:
+        """Return itself: it has its region."""
+        del region
+        return self
+
+    def of(self, x: Float) -> Float:
+        """Return the planes of a flat image on the region, with the target around it."""
+        if self.region is None:
+            # In memory allocated by Dr.Jit.
+            image = self.planes.of(x * opaque(mi.Float, 1))
+            return image if self.weight is None else image * self.weight
+        image = self.surroundings
+        if image is None:
+            assert self.around is not None
+            image = self.planes.copied(self.pixels, self.around)
+        places, valid = self._places
+        mode = dr.ReduceMode.NoConflicts
+        dr.scatter(image, self._masked(x), places, active=valid, mode=mode)
+        return image
+
+    def image(self, planes: Float) -> Float:
+        """Return the flat image on the region of planes, 0 where the target is masked."""
+        if self.region is None:
+            return self.planes.image(planes if self.weight is None else planes * self.weight)
+        places, valid = self._places
+        return self._masked(dr.gather(mi.Float, planes, places, active=valid))
+
+    def _masked(self, x: Float) -> Float:
+        """Return a flat image on the region, set to 0 where the target is masked."""
+        return x if self.weight is None else x * elements(self.weight, self._places[0])
 
 
 class Target:
@@ -89,15 +172,14 @@ class Target:
             self.weight = self._planes(np.repeat(mask[..., None], 3, axis=2).astype(np.float32))
             self.pixels = self.masked(self.pixels)
             dr.eval(self.pixels)
-        self.surroundings: Float | None = None
-        self._places: dict[Region, tuple[UInt32, Bool]] = {}
-        self._windows: dict[Region | None, _Windows] = {}
+        self._surroundings: Float | None = None
+        self._comparisons: dict[Region | None, Comparison] = {}
 
     def _planes(self, image: np.ndarray) -> Float:
         if image.dtype == np.uint8:  # a quarter of the memory to copy
-            pixels = mi.Float(
-                from_numpy(sys.modules[mi.Float.__module__].UInt8, image)
-            ) / dr.opaque(mi.Float, 255)
+            pixels = mi.Float(from_numpy(sys.modules[mi.Float.__module__].UInt8, image)) / opaque(
+                mi.Float, 255
+            )
             dr.eval(pixels)
         else:
             pixels = from_numpy(mi.Float, image)
@@ -118,19 +200,7 @@ class Target:
         """Return the target on a region, flat, 0 outside the view, and the weights of its numbers;
         None: 1.
         """
-        if region is None or region.whole:
-            return self.planes.image(
-                self.pixels
-            ), None if self.weight is None else self.planes.image(self.weight)
-        places, valid = self.places_on(region)
-        weight = None if self.weight is None else elements(self.weight, places)
-        return dr.gather(mi.Float, self.pixels, places, active=valid), weight
-
-    def places_on(self, region: Region) -> tuple[UInt32, Bool]:
-        """Return (places of the numbers of an image on a region, mask of those in the view)."""
-        if region not in self._places:
-            self._places[region] = self.planes.places_on(region)
-        return self._places[region]
+        return _on(self, region)
 
     def constant_error(self, region: Region | None = None) -> float:
         """Return the mean squared error of the best image of one grey, over the valid pixels of a
@@ -146,26 +216,46 @@ class Target:
         valid = valid_pixels(self._mask, self.shape) & (region is None or region.mask)
         return max(3 * int(valid.sum()), 1)
 
-    def windows_on(self, region: Region | None) -> _Windows:
-        """Return the windows that contain the pixels of a region, or all windows of the view for
-        None.
-        """
-        if region not in self._windows:
-            windows, count = self.planes.runs(region, RADIUS)
-            pixels, _ = self.planes.runs(region, 0)
-            height = dr.opaque(mi.Int32, self.planes.height)
+    def comparison(self, region: Region | None) -> Comparison:
+        """Return the target on a region, or on the whole view for None."""
+        if region not in self._comparisons:
+            windows_runs, count = self.planes.runs(region, RADIUS)
+            runs = {"windows": windows_runs, "lanes": self.planes.runs(region, 0)[0]}
+            windows = Lanes.of(windows_runs)
             (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(
-                windows, height, self.pixels
+                windows, opaque(mi.Int32, self.planes.height), self.pixels
             )
-            numbers = self._num_valid(region)
-            self._windows[region] = _Windows(windows, count, pixels, numbers, mean, variance)
-        return self._windows[region]
+            on = self._comparisons[region] = Comparison(
+                self.planes,
+                self.pixels,
+                region=region,
+                runs=runs,
+                weight=self.weight,
+                windows=windows,
+                mean=mean,
+                variance=variance,
+                count=count,
+                valid_share=1 / self._num_valid(region),
+                scale=1 / int(np.prod(self.shape)),
+                height=self.planes.height,
+            )
+            if region is not None:
+                runs["around"] = self.planes.runs_around(region, RADIUS)
+                if self._surroundings is None:
+                    self._surroundings = self.pixels + 0
+                on.surroundings = self._surroundings
+        return self._comparisons[region]
 
-    def masked(self, values: Float, places: UInt32 | None = None) -> Float:
-        """Return planes, or their numbers at `places`, set to 0 where the mask is False."""
-        if self.weight is None:
-            return values
-        return values * (self.weight if places is None else elements(self.weight, places))
+    def masked(self, values: Float) -> Float:
+        """Return planes, set to 0 where the mask is False."""
+        return values if self.weight is None else values * self.weight
+
+
+def _on(target: Target | Comparison, region: DrawnBlocks | None) -> tuple[Float, Float | None]:
+    """Return a target on a region, see `Target.on`."""
+    planes = target.planes
+    weight = None if target.weight is None else planes.on(target.weight, region)
+    return planes.on(target.pixels, region), weight
 
 
 class Recon(dr.CustomOp):
@@ -173,36 +263,23 @@ class Recon(dr.CustomOp):
 
     gradient: Float
 
-    def eval(self, x: Float, target: Target, weight: float, region: Region | None) -> Float:
-        planes = target.planes
-        places, valid = (None, True) if region is None else target.places_on(region)
-        if places is None:
-            # In memory allocated by Dr.Jit.
-            image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))
-        else:
-            if target.surroundings is None:
-                target.surroundings = target.pixels + 0
-            image = target.surroundings
-            mode = dr.ReduceMode.NoConflicts
-            dr.scatter(image, target.masked(x, places), places, active=valid, mode=mode)
-        on = target.windows_on(region)
-        scale = dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
-        height = dr.opaque(mi.Int32, planes.height)
+    def eval(self, x: Float, on: Comparison, weight: float) -> Float:
+        size = on.planes.size
+        image = on.of(x)
         dr.eval(image)
-        arguments = (on.windows, height, image, target.pixels, on.mean, on.variance)
-        derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
-        arguments = (on.pixels, height, image, target.pixels, derivatives, scale)
-        (gradient,), errors = recorded(_gradient_pass, planes.size, weight)(*arguments)
-        structure = dr.opaque(mi.Float, on.count) - dr.sum(ssim)
-        loss = scale * ((1 - weight) * dr.sum(errors.x) + weight * structure)
-        target.mse = dr.sum(errors.y) * dr.opaque(mi.Float, 1 / on.num_valid)
-        if places is None:
-            self.gradient = planes.image(target.masked(gradient))
-        else:
-            gradient = dr.gather(mi.Float, gradient, places, active=valid)
-            self.gradient = target.masked(gradient, places)
-        dr.eval(self.gradient, loss, target.mse)
-        return loss
+        height = opaque(mi.Int32, on.height)
+        scale = opaque(mi.Float, on.scale)
+        arguments = (on.windows, height, image, on.pixels, on.mean, on.variance)
+        derivatives, ssim = recorded(_similarity_pass, size)(*arguments)
+        arguments = (on.lanes, height, image, on.pixels, derivatives, scale)
+        (gradient,), errors = recorded(_gradient_pass, size, weight)(*arguments)
+        dr.schedule(ssim, errors)
+        self.gradient = on.image(gradient)
+        dr.eval(self.gradient)
+        # Not evaluated here: nothing but a report has the numbers.
+        structure = opaque(mi.Float, on.count) - dr.sum(ssim)
+        on.mse = dr.sum(errors.y) * opaque(mi.Float, on.valid_share)
+        return scale * ((1 - weight) * dr.sum(errors.x) + weight * structure)
 
     def backward(self) -> None:
         self.set_grad_in("x", self.gradient * self.grad_out())

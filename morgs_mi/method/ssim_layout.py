@@ -9,6 +9,7 @@ an image: derivatives of windows there are 0, and are read.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Bool, Float, Int32, Jit, UInt32
+from morgs_mi.core.arrays import from_numpy, opaque
+from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, UInt32
 from morgs_mi.render.backend import elements
-from morgs_mi.render.region import Region, quotient_and_rest
+from morgs_mi.render.region import DrawnBlocks, Region, quotient_and_rest
+
+RUN = ("left", "middle", "right", "first", "end", "columns")
+"""Names of the arrays of runs, see `Lanes.of`."""
 
 RADIUS = 5
 STRIP = 8  # pixels wide: a window extends at most into the next strip
@@ -41,6 +45,18 @@ class Lanes:
     end: Int32  #: Row past the last.
     columns: UInt32  #: Number of the strip's columns that lie in the image, 0 to 8.
 
+    @classmethod
+    def of(cls, runs: Mapping[str, Any]) -> Lanes:
+        """Return the lanes of some runs: arrays of NumPy or Dr.Jit by name, the places as ``left``,
+        ``middle`` and ``right``.
+        """
+        kinds = {"first": mi.Int32, "end": mi.Int32}
+        left, middle, right, first, end, columns = (
+            values if dr.is_array_v(values) else from_numpy(kinds.get(name, mi.UInt32), values)
+            for name, values in runs.items()
+        )
+        return cls((left, middle, right), first, end, columns)
+
 
 class Planes:
     """The layout of an image [H, W, 3] in planes."""
@@ -60,7 +76,7 @@ class Planes:
         strip, y, places = self._strips(self.num_columns * COLUMN)
         strip = strip - _SPARE
         if self.width % STRIP == 0:
-            strips = dr.opaque(mi.UInt32, self.num_strips)
+            strips = opaque(mi.UInt32, self.num_strips)
             reads = [
                 read_packet(image, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)
             ]
@@ -79,16 +95,23 @@ class Planes:
         values = [v for pixel in rows for v in pixel]
         if self.width % STRIP == 0:
             for k in range(3):
-                lane = 3 * (y * dr.opaque(mi.UInt32, self.num_strips) + strip) + k
+                lane = 3 * (y * opaque(mi.UInt32, self.num_strips) + strip) + k
                 write_packet(target, values[STRIP * k : STRIP * (k + 1)], lane)
         else:
             for value, (place, valid) in zip(values, self._numbers(strip, y), strict=True):
                 dr.scatter(target, value, place, valid, mode=dr.ReduceMode.NoConflicts)
         return target
 
+    def on(self, planes: Float, region: DrawnBlocks | None) -> Float:
+        """Return the flat image of planes on a region, 0 outside the view; None: of the view."""
+        if region is None or region.whole:
+            return self.image(planes)
+        places, valid = self.places_on(region)
+        return dr.gather(mi.Float, planes, places, active=valid)
+
     def _numbers(self, strip: UInt32, y: UInt32) -> list[tuple[UInt32, Bool]]:
         """Return (place in the flat image, in the view) of each number of a strip of a row."""
-        width = dr.opaque(mi.UInt32, self.width)
+        width = opaque(mi.UInt32, self.width)
         x = strip * STRIP
         first = 3 * (y * width + x)
         return [(first + k, x + k // 3 < width) for k in range(3 * STRIP)]
@@ -109,21 +132,19 @@ class Planes:
         """Return the place of a number; all arguments are integers, NumPy's or Dr.Jit's."""
         sizes: Any = self.height, self.num_columns
         if dr.is_jit_v(x):
-            sizes = (dr.opaque(mi.UInt32, size) for size in sizes)
+            sizes = (opaque(mi.UInt32, size) for size in sizes)
         height, num_columns = sizes
         x = x + _SPARE * STRIP
         column = component * num_columns + x // (COLUMN * STRIP)
         return (column * height + y) * (COLUMN * STRIP) + x % (COLUMN * STRIP)
 
-    def places_on(self, region: Region) -> tuple[UInt32, Bool]:
+    def places_on(self, region: DrawnBlocks) -> tuple[UInt32, Bool]:
         """Return the places of the numbers of a flat image on a region, and the mask of those in
         the view.
         """
         component, x, y = self._pixels_of(region)
-        valid = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
-        places = dr.select(valid, self._place(component, y, x), 0)
-        dr.eval(places, valid)
-        return places, valid
+        valid = (x < opaque(mi.UInt32, self.width)) & (y < opaque(mi.UInt32, self.height))
+        return dr.select(valid, self._place(component, y, x), 0), valid
 
     def gradient_on(self, planes: Float, region: Region) -> tuple[Float, Float]:
         """Return the derivatives of an image in `planes` along x and y on a region, flat, per px,
@@ -132,7 +153,7 @@ class Planes:
         component, x, y = self._pixels_of(region)
         xs, ys = (
             [
-                dr.minimum(dr.maximum(mi.Int32(v) + step, 0), dr.opaque(mi.Int32, size - 1))
+                dr.minimum(dr.maximum(mi.Int32(v) + step, 0), opaque(mi.Int32, size - 1))
                 for step in (-1, 0, 1)
             ]
             for v, size in ((x, self.width), (y, self.height))
@@ -148,52 +169,102 @@ class Planes:
         dr.eval(along_x, along_y)
         return along_x, along_y
 
-    def _pixels_of(self, region: Region) -> tuple[UInt32, UInt32, UInt32]:
+    def _pixels_of(self, region: DrawnBlocks) -> tuple[UInt32, UInt32, UInt32]:
         """Return (component, x, y) of the numbers of a flat image on a region."""
         lane = dr.arange(mi.UInt32, 3 * region.num_pixels)
         pixel = lane // 3
         return lane - 3 * pixel, *region.pixels(pixel)
 
-    def runs(self, region: Region | None, reach: int) -> tuple[Lanes, int]:
+    def runs(self, region: Region | None, reach: int) -> tuple[Arrays, int]:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around
-        it, and how many numbers of the image they cover.
+        it, as `Lanes.of` takes them, and how many numbers of the image they cover.
         """
-        cells = np.ones((self.height, self.num_strips), bool)  # the strips of each row
-        if region is not None:
-            mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
-            cells = np.any(mask.reshape(self.height, self.num_strips, STRIP), axis=2)
-        cells = np.pad(cells, ((0, 0), (1, 1)))
+        return self._runs(self._cells(region, reach), 1)
+
+    def runs_around(self, region: Region, reach: int) -> Arrays:
+        """Return the runs of all that windows read whose centres are in `runs`, likewise."""
+        cells = self._cells(region, reach)
+        wide = cv2.copyMakeBorder(cells, 0, 0, 1, 1, cv2.BORDER_CONSTANT)
+        return self._runs(_within(wide, reach), 2)[0]
+
+    def _cells(self, region: Region | None, reach: int) -> np.ndarray:
+        """Return the strips of each row, and one on either side, that `runs` cover: uint8, 1 where
+        they do.
+        """
+        cells = np.zeros((self.height, self.num_strips + 2), np.uint8)
+        inner = cells[:, 1:-1]
+        if region is None:
+            inner[:] = 1
+        else:
+            width, height = region.block
+            first = STRIP * np.arange(self.num_strips)
+            last = np.minimum(first + STRIP, self.width) - 1
+            # A strip lies in two blocks at most.
+            strips = region.drawn[:, first // width] | region.drawn[:, last // width]
+            inner[:] = strips.repeat(height, axis=0)[: self.height]
         if reach:  # those within `reach` rows, or in the next strip, too
-            cells = cv2.dilate(cells.astype(np.uint8), np.ones((2 * reach + 1, 3), np.uint8)) > 0
+            cells = _within(cells, reach)
             cells[:, 0] = cells[:, 1]
             cells[:, -1] = cells[:, -2]
-        # The runs of cells in each column, in parts that are not too long.
-        edges = np.diff(np.pad(cells.T, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-        strip, first = np.nonzero(edges == 1)
-        end = np.nonzero(edges == -1)[1]
+        return cells
+
+    def _runs(self, cells: np.ndarray, margin: int) -> tuple[Arrays, int]:
+        """Return the runs of some strips of each row, of which `margin` lie on either side of the
+        image, and how many numbers of the image they cover.
+        """
+        # The runs of cells in each column, in parts that are not too long: a row of zeros is before
+        # every column, and after the last one.
+        rows = self.height + 1
+        edges = np.zeros(cells.shape[1] * rows + 1, np.uint8)
+        edges[:-1].reshape(-1, rows)[:, 1:] = cells.T
+        first, end = np.flatnonzero(edges[1:] != edges[:-1]).reshape(-1, 2).T
+        strip = first // rows
+        first = first - strip * rows
+        end = end - strip * rows
         parts = -(-(end - first) // _LONGEST)
         index = np.repeat(np.arange(len(strip)), parts)
         part = np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts)
         first = first[index] + _LONGEST * part
         end = np.minimum(end[index], first + _LONGEST)
-        strip = strip[index]
+        strip = strip[index] - margin  # the first one of the image is 0
         # The lanes of a packet are neighbours in one column.
-        order = np.lexsort((strip, first, (strip + _SPARE - 1) // COLUMN))
-        strip, first, end = np.stack([strip, first, end])[:, order]
-        columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
-        component = np.repeat(np.arange(3), len(strip))
-        x = np.tile(strip - 1, 3) * STRIP  # strip 1 is the first of the image
-        left, middle, right = (
-            from_numpy(mi.UInt32, self._place(component, 0, x + k * STRIP) // STRIP)
-            for k in (-1, 0, 1)
-        )
-        lanes = Lanes(
-            (left, middle, right),
-            from_numpy(mi.Int32, np.tile(first, 3)),
-            from_numpy(mi.Int32, np.tile(end, 3)),
-            from_numpy(mi.UInt32, np.tile(columns, 3)),
-        )
-        return lanes, 3 * int(((end - first) * columns).sum())
+        order = np.lexsort((strip, first, (strip + _SPARE) // COLUMN))
+        strip = strip[order]
+        first = first[order]
+        end = end[order]
+        columns = np.clip(self.width - strip * STRIP, 0, STRIP) * (strip >= 0)
+        count = 3 * int(((end - first) * columns).sum())
+        # In all three planes, one after the other.
+        planes = np.arange(3)[:, None] * (self.size // (3 * STRIP))
+        near = strip + np.arange(-1, 2)[:, None]
+        numbers = np.empty((len(RUN), 3, len(strip)), np.int32)
+        numbers[:3] = (self._place(0, 0, near * STRIP) // STRIP)[:, None] + planes
+        numbers[3:] = np.stack([first, end, columns])[:, None]
+        kinds = (np.uint32, np.uint32, np.uint32, np.int32, np.int32, np.uint32)
+        runs = {
+            name: values.ravel().view(kind)
+            for name, values, kind in zip(RUN, numbers, kinds, strict=True)
+        }
+        return runs, count
+
+    def copied(self, planes: Float, lanes: Lanes) -> Float:
+        """Return planes that are defined on some runs alone."""
+        target = dr.empty(mi.Float, self.size)
+
+        def step(row):
+            place = lanes.places[1] + mi.UInt32(row) * COLUMN
+            write_packet(target, list(read_packet(planes, place)), place)
+            return (row + 1,)
+
+        # Without `target` in the state: what is written to it next would copy it.
+        dr.while_loop((lanes.first,), lambda row: row < lanes.end, step, label="copied rows")
+        dr.eval(target)  # before anything else is written to it
+        return target
+
+
+def _within(cells: np.ndarray, reach: int) -> np.ndarray:
+    """Return the strips within `reach` rows of some strips of each row, or in the next strip."""
+    return np.asarray(cv2.dilate(cells, np.ones((2 * reach + 1, 3), np.uint8)))
 
 
 def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit:

@@ -19,12 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import concatenated
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Arrays, Float
-from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView, Drawing, ViewGroup
+from morgs_mi.method.observed_view import ObservedView
+from morgs_mi.render.active_view import Drawing, ViewGroup
 from morgs_mi.render.backend import elements
-from morgs_mi.render.projection import concatenated
 
 _Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
 
@@ -57,13 +57,12 @@ class KeyImages:
     """Images of key views, which renderings are compared with.
 
     Args:
-        views: V >= 1 active views, by view index.
-        targets: their images, by view index.
+        views: V >= 1 active views with their images, by view index.
     """
 
-    def __init__(self, views: Mapping[int, ActiveView], targets: Mapping[int, Target]) -> None:
+    def __init__(self, views: Mapping[int, ObservedView]) -> None:
         self.views = views
-        self._targets = [targets[v] for v in views]
+        self._targets = [view.target for view in views.values()]
         self.group = ViewGroup([*views.values()])
 
     def sums(self, gaussians: Gaussians, names: Sequence[str]) -> Arrays:
@@ -133,13 +132,13 @@ class KeyImages:
         ]
         pixels, weights = ([*column] for column in zip(*target_numbers, strict=True))
         if all(weight is None for weight in weights):
-            return _end_to_end(pixels), None
+            return concatenated(pixels), None
         pairs = zip(weights, pixels, strict=True)
         full_weights = [
             dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight
             for weight, part in pairs
         ]
-        return _end_to_end(pixels), _end_to_end(full_weights)
+        return concatenated(pixels), concatenated(full_weights)
 
     @cached_property
     def _gradient(self) -> tuple[Float, Float]:
@@ -147,16 +146,8 @@ class KeyImages:
         pairs = zip(self._targets, self.group.regions, strict=True)
         gradients = [target.planes.gradient_on(target.pixels, region) for target, region in pairs]
         x, y = zip(*gradients, strict=True)
-        return _end_to_end(x), _end_to_end(y)
+        return concatenated(x), concatenated(y)
 
 
 def _dot(a: list[Float], b: list[Float]) -> Float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _end_to_end(parts: Sequence[Float]) -> Float:
-    whole = parts[0]
-    for part in parts[1:]:
-        whole = concatenated(whole, part)
-    dr.eval(whole)
-    return whole

@@ -21,7 +21,9 @@ from morgs_mi.core.types import Arrays
 from morgs_mi.playback.stream_header import metadata_entry, render_config, stream_exposure
 from morgs_mi.playback.visualise import (
     LARGEST_ERROR,
+    color_bar,
     confidence_image,
+    contact_sheet,
     depth_image,
     depth_limits,
     error_image,
@@ -39,6 +41,7 @@ MOTION_SCALE = 0.03
 frame.
 """
 _MOST_TIMED_FRAMES = 30
+_THUMBNAILS_PER_ROW = 4
 
 
 def render_stream(
@@ -64,6 +67,26 @@ def render_stream(
         yield frame, render(gaussians, camera, channels or available_channels(gaussians), config)
 
 
+def camera_sheet(stream: FrameSource, width: int) -> np.ndarray:
+    """Return the first frame of a stream as each of its cameras sees it, uint8 RGB: images of one
+    size with the names of the cameras, at most four in a row.
+
+    Args:
+        stream: the file.
+        width: of the image of a camera, pixels.
+
+    Raises:
+        ValueError: a broken packet.
+    """
+    _, gaussians = next(play(stream))
+    W, H = stream.cameras[0].with_width(width).size
+    images = [
+        label(picture(stream, gaussians, camera.resized(W, H)), camera.name)
+        for camera in stream.cameras
+    ]
+    return contact_sheet(np.array_split(images, -(-len(images) // _THUMBNAILS_PER_ROW)))
+
+
 def has_confidence(stream: FrameSource) -> bool:
     """Return whether a stream stores a confidence, and the fit has learned it.
 
@@ -76,7 +99,12 @@ def has_confidence(stream: FrameSource) -> bool:
     )
 
 
-def channel_image(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:
+def channel_image(
+    name: str,
+    image: np.ndarray,
+    motion_scale: float | None = None,
+    color: np.ndarray | None = None,
+) -> np.ndarray:
     """Return the visualisation of a rendered channel, uint8 RGB [H, W, 3].
 
     Args:
@@ -84,9 +112,10 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
         image: values of the channel [H, W, C].
         motion_scale: speed of full saturation in pixels. The default is `MOTION_SCALE`, which is
             the same for all frames of a clip.
+        color: image [H, W, 3] under the motion, in grey; without one, no motion is white.
     """
     if name == "motion":
-        return motion_image(image, motion_scale or MOTION_SCALE * image.shape[1])
+        return motion_image(image, motion_scale or MOTION_SCALE * image.shape[1], color)
     draw = {
         "color": to_uint8,
         "confidence": confidence_image,
@@ -97,39 +126,38 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
 
 
 def explained_image(
-    name: str, image: np.ndarray, motion_scale: float | None = None, title: str = ""
+    name: str,
+    image: np.ndarray,
+    motion_scale: float | None = None,
+    title: str = "",
+    color: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the `channel_image` of a channel, unless it is the colour with its legend: a label
-    with the values of the first and the last colour, and the wheel of motion in the lower right
-    corner or a bar of the colours along the lower edge.
+    """Return the `channel_image` of a channel, unless it is the colour with a label and a legend:
+    the wheel of motion in the lower right corner, with the speed at its rim in the label, or a bar
+    of the colours along the lower edge, with numbers at both ends.
 
     Args:
         name: of the channel.
         image: values of the channel [H, W, C].
         motion_scale: as for `channel_image`.
         title: start of the label, by default the name.
+        color: as for `channel_image`.
     """
     H, W = image.shape[:2]
     scale = motion_scale or MOTION_SCALE * W
-    picture = channel_image(name, image, scale)
+    picture = channel_image(name, image, scale, color)
     if name == "color":
         return picture
-    limits = {
-        "motion": (0, scale),
-        "error": (0, LARGEST_ERROR),
-        "depth": depth_limits(image),
-    }
-    least, largest = limits.get(name, (0, 1))
-    text = f"{title or name}, {least:.3g} to {largest:.3g}"
+    text = title or name
     if name == "motion":
-        size = H // 5 + 1
-        picture[-size:, -size:] = motion_legend(scale, size)
-        text += " px"
-    else:
-        size = H // 30 + 1
-        picture[-size - 1 :] = 255
-        picture[-size:] = channel_image(name, np.linspace(least, largest, W)[None, :, None])
-    return label(picture, text)
+        size = min(H, W) // 5 + 1
+        corner = None if color is None else color[-size:, -size:]
+        picture[-size:, -size:] = motion_legend(scale, size, corner)
+        return label(picture, f"{text}, rim {scale:.3g} px")
+    limits = {"error": (0, LARGEST_ERROR), "depth": depth_limits(image)}
+    least, largest = limits.get(name, (0, 1))
+    colors = channel_image(name, np.linspace(least, largest, W)[None, :, None])
+    return label(color_bar(picture, colors, (least, largest)), text)
 
 
 def playback_speed(stream: FrameSource, camera: Camera, config: RenderConfig) -> dict[str, float]:
@@ -208,12 +236,9 @@ def picture(
     """
     config = render_config(stream)
     values = render(gaussians, camera, (channel,), config)[channel]
+    color = None
     if channel == "color":
         values = exposed(values, stream_exposure(stream))
-    image = channel_image(channel, values, motion_scale)
     if channel == "motion":
-        still = 1 - np.minimum(np.linalg.norm(values, axis=2, keepdims=True) / motion_scale, 1)
         color = np.array(rasterize(gaussians, camera, ("color",), (0, 0, 0), config=config).color)
-        grey = color.clip(0, 1) @ np.array([[0.299], [0.587], [0.114]])
-        image = to_uint8(image / 255 - still * (1 - grey))
-    return image
+    return channel_image(channel, values, motion_scale, color)

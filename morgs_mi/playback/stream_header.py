@@ -18,11 +18,12 @@ from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
-from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import bounded, check_number, numbers, view_index
-from morgs_mi.core.config import Config, apply_values, types_of
-from morgs_mi.core.files import CAPTURE, STREAM
+from morgs_mi.platform.bounded import JsonObject, read_json
+from morgs_mi.platform.checks import bounded, check_number, numbers, view_index
+from morgs_mi.platform.config import Config, apply_values, types_of
+from morgs_mi.platform.files import CAPTURE, REPORT, STREAM
+from morgs_mi.playback.default_rig import BOX
 from morgs_mi.render.render_config import RenderConfig
 
 _JSON_TYPES = {
@@ -124,6 +125,15 @@ def stream_origin(stream: FrameSource) -> np.ndarray:
         ValueError: the stream's header states something else.
     """
     return _header_numbers(stream, "origin", stream.metadata.get("origin", [0.0, 0.0, 0.0]), (3,))
+
+
+def stream_box(stream: FrameSource) -> np.ndarray:
+    """Return the `scene_box` [2, 3] that the cameras of a stream without a recording see.
+
+    Raises:
+        ValueError: the stream's header states something else, or nothing.
+    """
+    return _header_numbers(stream, BOX, stream.metadata.get(BOX), (2, 3))
 
 
 def _header_numbers(
@@ -250,6 +260,16 @@ def fitted_capture(stream: FrameSource) -> str:
     )
 
 
+def between_cameras(stream: FrameSource) -> str:
+    """Return the quality to expect of views between the cameras, such as ``poor (58 degrees
+    apart)``, from the report of the fit beside a stream; empty without one.
+    """
+    with suppress(OSError, ValueError, LookupError, TypeError, OverflowError):
+        expected = read_json(stream.path.with_name(REPORT))["frames"][0]["validation"]
+        return f"{expected['quality']} ({float(expected['spacing']):.0f} degrees apart)"
+    return ""
+
+
 def as_fitted(capture: Capture, stream: FrameSource) -> Capture:
     """Return a capture with the cameras of a stream, which its fit may have refined.
 
@@ -262,10 +282,10 @@ def as_fitted(capture: Capture, stream: FrameSource) -> Capture:
     return capture.with_cameras(capture.with_delays(stream.cameras), terms.tolist())
 
 
-def about_lenses(capture: Capture) -> dict[str, Any]:
+def about_lenses(capture: Capture) -> JsonObject:
     """Return the entries of a stream's header that `as_fitted` reads, none where no distortion was
     refined.
     """
-    pairs = zip(capture.names, capture.distortions, strict=bool(capture.distortions))
-    distortions = {name: list(terms) for name, terms in pairs if any(terms)}
+    views = capture.views
+    distortions = {view.name: list(view.distortion) for view in views if any(view.distortion)}
     return {"distortions": distortions} if distortions else {}

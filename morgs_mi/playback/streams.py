@@ -14,12 +14,12 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.checks import errors_at, quantity, require
-from morgs_mi.core.files import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.splats import read_splats, suffix_of
-from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig, trained_cameras
+from morgs_mi.platform.checks import errors_at, quantity, require
+from morgs_mi.platform.files import PROVISIONAL, STREAM
+from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, default_rig, scene_box, trained_cameras
 from morgs_mi.playback.export.web import stream_html
 
 DRAWN = 0.5
@@ -61,8 +61,12 @@ class SplatFile(FrameSource):
         self.path = path
         self.fps = 30.0
         self.metadata = {"num_frames": 1, DEFAULT_RIG: not trained}
-        with errors_at(path):
-            self.cameras = trained or default_rig([gaussians])
+        self.cameras = trained
+        if not trained:
+            with errors_at(path):
+                box = scene_box([gaussians])
+                self.cameras = default_rig([gaussians], box)
+            self.metadata[BOX] = box.tolist()
         motion = np.zeros((len(gaussians), 3), np.float32)
         ids = np.arange(len(gaussians), dtype=np.uint32)
         self._state = FrameState(0, ids, replace(gaussians, motion=motion))

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.files import FilePath, atomic_path
-from morgs_mi.core.png import png_bytes
+from morgs_mi.platform.files import FilePath, atomic_path
+from morgs_mi.platform.png import png_bytes
 
 GAP = 4
 """Space between the images of a row or sheet, in pixels."""
@@ -23,6 +23,8 @@ UNDEFINED = (128, 128, 128)
 """Colour of pixels with a value that is not finite, or a depth that is not positive."""
 LARGEST_ERROR = 0.1
 """Error of the brightest colour of `error_image`, as a share of white."""
+# Weights of R, G, B in a grey image.
+_LUMA = np.array([0.299, 0.587, 0.114])
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -45,9 +47,11 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     return np.broadcast_to(levels, (*image.shape[:2], 3)).copy()
 
 
-def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
-    """Return motion as colours: the hue is the direction, the saturation is the speed, white is no
-    motion.
+def motion_image(
+    motion: np.ndarray, scale_px: float, color: np.ndarray | None = None
+) -> np.ndarray:
+    """Return motion as colours: the hue is the direction, the saturation is the speed. No motion is
+    white, or the grey image of `color`.
 
     Right is red, and the hue increases clockwise on the screen: down is yellow-green, left is cyan,
     up is violet. Speeds of `scale_px` or more are fully saturated; images with the same scale are
@@ -56,6 +60,7 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     Args:
         motion: [H, W, 2] in pixels, x to the right and y down.
         scale_px: speed of full saturation, in pixels.
+        color: image [H, W, 3] that moves, see `to_uint8`; None: it is not shown.
 
     Raises:
         ValueError: `motion` is not [H, W, 2], or the scale is not positive.
@@ -71,19 +76,23 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     hue = np.rad2deg(np.arctan2(y, x)) % 360
     saturation = np.minimum(np.hypot(x, y) / scale_px, 1)
     hsv = np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
-    image = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    image = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
+    if color is not None:
+        darkness = 1 - to_uint8(color) / 255 @ _LUMA
+        image = image - ((1 - saturation) * darkness)[..., None]
+    image = to_uint8(image)
     image[~valid] = UNDEFINED
     return image
 
 
-def motion_legend(scale_px: float, size: int) -> np.ndarray:
+def motion_legend(scale_px: float, size: int, color: np.ndarray | None = None) -> np.ndarray:
     """Return the legend [size, size, 3] of `motion_image`: a disc of its colours, with the speed
-    `scale_px` at the rim.
+    `scale_px` at the rim, over the grey image of `color` [size, size, 3] or white.
     """
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
-    return motion_image(motion, scale_px)
+    return motion_image(motion, scale_px, color)
 
 
 def confidence_image(confidence: np.ndarray) -> np.ndarray:
@@ -126,20 +135,44 @@ def depth_image(depth: np.ndarray) -> np.ndarray:
 def label(image: np.ndarray, text: str) -> np.ndarray:
     """Return the image with `text` (ASCII) in its top left corner, white on a dark strip."""
     image = to_uint8(image)
-    scale = np.clip(image.shape[1] / 640, 0.35, 1.0)
-    thickness = 2 if scale > 0.8 else 1
-    (width, height), base = cv2.getTextSize(text, _FONT, scale, thickness)
-    image[: height + base + 4, : width + 8] //= 4
-    cv2.putText(image, text, (4, height + 3), _FONT, scale, (255, 255, 255), thickness, cv2.LINE_AA)
+    letters = _letters(text, image)
+    corner = image[: len(letters), : letters.shape[1]]
+    corner //= 4
+    np.maximum(corner, letters[: len(corner), : corner.shape[1]], out=corner)
     return image
 
 
-def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
+def color_bar(image: np.ndarray, colors: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+    """Return the image with a bar of `colors` [1, N, 3] along its lower edge, between the numbers
+    at both ends.
+    """
+    image = to_uint8(image)
+    H, W = image.shape[:2]
+    first, last = (_letters(f"{number:.3g}", image) for number in ends)
+    size = max(1, W - first.shape[1] - last.shape[1]), len(first)
+    bar = np.concatenate([first, cv2.resize(colors, size), last], axis=1)[-H:, :W]
+    image[-len(bar) :, : bar.shape[1]] = bar
+    return image
+
+
+def _letters(text: str, image: np.ndarray) -> np.ndarray:
+    """Return a text [h, w, 3] white on black, as large as an image needs it."""
+    scale = np.clip(image.shape[1] / 640, 0.35, 1.0)
+    thickness = 2 if scale > 0.8 else 1
+    (width, _), _ = cv2.getTextSize(text, _FONT, scale, thickness)
+    (_, height), base = cv2.getTextSize("Ag", _FONT, scale, thickness)  # of any text
+    letters = np.zeros((height + base + 4, width + 8, 3), np.uint8)
+    white = (255, 255, 255)
+    cv2.putText(letters, text, (4, height + 3), _FONT, scale, white, thickness, cv2.LINE_AA)
+    return letters
+
+
+def side_by_side(images: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
     """Return the images, at least one, in one row on white, aligned at the top, 4 pixels apart."""
     return _concatenate([to_uint8(image) for image in images], axis=1)
 
 
-def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+def contact_sheet(rows: Sequence[Sequence[np.ndarray] | np.ndarray]) -> np.ndarray:
     """Return rows of images (see `side_by_side`) below each other, aligned at the left."""
     return _concatenate([side_by_side(row) for row in rows], axis=0)
 

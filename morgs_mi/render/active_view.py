@@ -19,58 +19,84 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.arrays import from_numpy, opaque
+from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Tensor, UInt32
-from morgs_mi.render.backend import block_shape, elements
+from morgs_mi.platform.checks import check_type, require
+from morgs_mi.render.backend import block_shape
+from morgs_mi.render.background import backdrops, over
 from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
 from morgs_mi.render.compositing import Layout, blend, record_gradients
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
-from morgs_mi.render.projection import Splats, Views, project
-from morgs_mi.render.rasterize import Image, backdrops, over, rasterize
+from morgs_mi.render.projection import Splats, TracedCameras, project
 from morgs_mi.render.region import BlockGrid, Region, joined, quotient_and_rest
 from morgs_mi.render.render_config import RenderConfig
 
 
 @dataclass(frozen=True, eq=False)
+class StaticSplats:
+    """Static splats of one view: a range of the static splats of several views."""
+
+    together: Splats  #: Of all these views, which are projected at once.
+    first: int  #: Index of the view's first one.
+    count: int  #: Number of the view's.
+
+    def __len__(self) -> int:
+        return self.count
+
+    @cached_property
+    def alone(self) -> Splats:
+        """The view's splats."""
+        with dr.suspend_grad():
+            lane = dr.arange(mi.UInt32, self.count) + opaque(mi.UInt32, self.first)
+            splats = self.together.at(lane)
+            dr.eval(splats)
+        return splats
+
+
+@dataclass(frozen=True, eq=False)
 class ActiveView:
-    """A view, or its active region, through which Gaussians are rendered."""
+    """A view, or its active region, through which Gaussians are rendered (see `render_view`).
+
+    Raises:
+        ValueError: an argument of another type, or a region of another view or block shape.
+    """
 
     camera: Camera  #: The view.
     config: RenderConfig = field(default_factory=RenderConfig)  #: Cut-offs and block shape.
     region: Region | None = None  #: The blocks of pixels that are drawn; None: the whole view.
     #: Further splats that are drawn there and get no gradients; None: none.
-    static_splats: Splats | None = None
+    static_splats: StaticSplats | None = None
 
-    def render(
-        self,
-        gaussians: ActivatedGaussians,
-        channels: Sequence[str] = ("color",),
-        detach_weights: Sequence[str] = (),
-        features: Tensor | None = None,
-    ) -> Image:
-        """Return the image of Gaussians in this view, see `rasterize`; static splats have features
-        of 0.
-        """
-        return rasterize(
-            gaussians,
-            self.camera,
-            channels,
-            self._background,
-            detach_weights=detach_weights,
-            region=self.region,
-            features=features,
-            static_splats=self.static_splats,
-            config=self.config,
-        )
+    def __post_init__(self) -> None:
+        place = "ActiveView()"
+        check_type(place, "camera", self.camera, Camera, OF_SENSOR)
+        check_type(place, "config", self.config, RenderConfig)
+        if self.static_splats is not None:
+            check_type(place, "static_splats", self.static_splats, StaticSplats)
+        if self.region is not None:
+            check_type(place, "region", self.region, Region)
+            size = f"{self.region.width}x{self.region.height}"
+            block = self.grid.block
+            require(
+                (self.region.width, self.region.height) == self.camera.size
+                and self.region.block == block,
+                place,
+                f"`region` must be of a {self.camera.width}x{self.camera.height} view with "
+                f"{block[0]}x{block[1]} blocks like the camera's and the config's",
+                f"{size} with {self.region.block[0]}x{self.region.block[1]}",
+                "build it for this camera with this config",
+            )
 
     @cached_property
-    def _background(self) -> Tensor | None:
-        """The camera's image behind the drawn pixels; None without one."""
+    def background(self) -> Sequence[float] | Tensor | None:
+        """The camera's image behind the drawn pixels, or the colour of the config."""
         images = backdrops([self.camera], self.config)
-        return None if images is None else from_numpy(mi.TensorXf, self.crop(images[0]))
+        if images is None:
+            return self.config.background
+        return from_numpy(mi.TensorXf, self.crop(images[0]))
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return the drawn pixels of an image [H, W, ...] of the view."""
@@ -87,36 +113,6 @@ class ActiveView:
         """
         blocks = blocks if self.region is None else blocks & self.region.drawn
         return replace(self, region=Region(self.grid, blocks)) if blocks.any() else None
-
-
-def make_active_view(
-    camera: Camera,
-    region: Region,
-    static: ActivatedGaussians,
-    channels: Sequence[str],
-    config: RenderConfig,
-) -> ActiveView:
-    """Return the active view of a region.
-
-    The static Gaussians are projected here, once, and not again when active Gaussians are rendered
-    with them.
-
-    Args:
-        camera: the view.
-        region: the blocks to draw.
-        static: N >= 0 Gaussians, detached.
-        channels: all channels that will be rendered.
-        config: cut-offs and block shape.
-    """
-    names = tuple(name for name in channels if name != "alpha")
-    static_splats = None
-    if int(static.means.shape[0]):
-        with dr.suspend_grad():
-            rows = dr.compress(touches(project(static, camera, (), config), region))
-            if dr.width(rows):
-                static_splats = project(static, camera, names, config, rows)
-                dr.eval(vars(static_splats))
-    return ActiveView(camera, config, region, static_splats)
 
 
 class ViewGroup:
@@ -159,6 +155,50 @@ class ViewGroup:
             return self.config.background
         return from_numpy(mi.Float, self.crop(images).ravel())
 
+    @cached_property
+    def _cameras(self) -> TracedCameras:
+        """The cameras of the views."""
+        return TracedCameras.of([view.camera for view in self.views])
+
+    def _touching(self, gaussians: ActivatedGaussians) -> UInt32:
+        """Return (view * N + Gaussian), ascending, of each of N > 0 Gaussians in each view that has
+        a block that it touches.
+        """
+        N = int(gaussians.means.shape[0])
+        with dr.suspend_grad():
+            view, row = quotient_and_rest(dr.arange(mi.UInt32, N * len(self.views)), N)
+            splats = project(gaussians, self._cameras.of_each(view), (), self.config, row)
+            return dr.compress(touches(splats, self.region))
+
+    def with_static(
+        self, static: ActivatedGaussians, channels: Sequence[str]
+    ) -> tuple[ActiveView, ...]:
+        """Return the views, each with the static Gaussians that touch its region behind the active
+        ones.
+
+        They are projected here, once, into all views together.
+
+        Args:
+            static: N Gaussians, detached.
+            channels: all channels that will be rendered in any view.
+        """
+        N = int(static.means.shape[0])
+        lanes = np.asarray(self._touching(static)) if N else np.arange(0)
+        if not len(lanes):
+            return self.views
+        with dr.suspend_grad():
+            view, row = quotient_and_rest(from_numpy(mi.UInt32, lanes), N)
+            camera = self._cameras.of_each(view)
+            splats = project(static, camera, tuple(channels), self.config, row)
+            splats = replace(splats, view=None)
+            dr.make_opaque(splats)
+        firsts = np.searchsorted(lanes, N * np.arange(len(self.views) + 1))
+        views = [*self.views]
+        for v in np.flatnonzero(np.diff(firsts)).tolist():
+            part = StaticSplats(splats, int(firsts[v]), int(firsts[v + 1] - firsts[v]))
+            views[v] = replace(views[v], static_splats=part)
+        return tuple(views)
+
     @with_render_lock
     def draw(self, gaussians: ActivatedGaussians) -> Drawing:
         """Project Gaussians into all views and list those that touch each block.
@@ -167,17 +207,13 @@ class ViewGroup:
             gaussians: N > 0 Gaussians.
         """
         N = int(gaussians.means.shape[0])
-        V = len(self.views)
-        cameras = [view.camera for view in self.views]
         with dr.suspend_grad():
-            view, row = quotient_and_rest(dr.arange(mi.UInt32, N * V), N)
-            lanes = dr.compress(
-                touches(project(gaussians, Views(cameras, view), (), self.config, row), self.region)
-            )
+            lanes = self._touching(gaussians)
             splats = self._static
             if dr.width(lanes):
                 view, row = quotient_and_rest(lanes, N)
-                visible = project(gaussians, Views(cameras, view), ("color",), self.config, row)
+                camera = self._cameras.of_each(view)
+                visible = project(gaussians, camera, ("color",), self.config, row)
                 splats = visible if splats is None else visible.concatenated_with(splats)
             if splats is None:
                 return Drawing(self, None, lanes, N)
@@ -187,21 +223,23 @@ class ViewGroup:
     @cached_property
     def _static(self) -> Splats | None:
         """The static splats of all views that touch their regions; None if there are none."""
-        splats: Splats | None = None
-        for index, view in enumerate(self.views):
-            if view.static_splats is not None:
-                view_splats = replace(
-                    view.static_splats,
-                    view=dr.full(mi.UInt32, index, len(view.static_splats)),
-                    channels={"color": view.static_splats.channels["color"]},
-                )
-                splats = view_splats if splats is None else splats.concatenated_with(view_splats)
-        if splats is None:
+        parts = [
+            replace(
+                view.static_splats.alone,
+                view=dr.full(mi.UInt32, index, len(view.static_splats)),
+                channels={"color": view.static_splats.alone.channels["color"]},
+            )
+            for index, view in enumerate(self.views)
+            if view.static_splats is not None
+        ]
+        if not parts:
             return None
+        splats = parts[0].concatenated_with(*parts[1:])
+        dr.eval(splats)  # one kernel, not one for each column that is read below
         rows: Any = dr.compress(touches(splats, self.region))
         if not dr.width(rows):
             return None
-        return Splats(**dr.gather(dict, vars(splats), rows))
+        return splats.at(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +286,7 @@ class Drawing:
         sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
         lanes = np.asarray(self.lanes)
         if len(lanes):
-            sums[lanes] = np.stack(self._sums(image, channels), axis=1)
+            sums[lanes] = self._sums(image, channels)
         return sums.reshape(-1, self.count, channels)
 
     def totals(self, image: Float, channels: int) -> np.ndarray:
@@ -258,23 +296,31 @@ class Drawing:
         if not dr.width(self.lanes):
             return np.zeros((self.count, channels), np.float32)
         rows = np.asarray(self.lanes) % self.count
-        totals = [np.bincount(rows, sums, self.count) for sums in self._sums(image, channels)]
+        totals = [np.bincount(rows, sums, self.count) for sums in self._sums(image, channels).T]
         return np.stack(totals, axis=1).astype(np.float32)
 
     @with_render_lock
-    def _sums(self, image: Float, channels: int) -> list[Float]:
-        """Return the sums of each channel, one per lane."""
+    def _sums(self, image: Float, channels: int) -> np.ndarray:
+        """Return the sums of each lane, float32 [L, C]."""
         assert self.drawn is not None
         splats, lists = self.drawn
         with dr.suspend_grad():
             columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
             records = pack_records([*splats.geometry, *columns], lists.depth_order_of)
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
-            grads = record_gradients(replace(lists, records=records), layout, [image], [image])
-            place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after
-            lane_sums = [elements(grad, place) for grad in grads]
-            dr.eval(lane_sums)
-        return lane_sums
+            lane_sums = record_gradients(
+                self.group.region,
+                replace(lists, records=records),
+                layout,
+                [image],
+                [image],
+                dr.width(self.lanes),  # static splats come after
+            )
+            lane = dr.arange(mi.UInt32, dr.width(self.lanes)) * channels
+            sums = dr.empty(mi.Float, dr.width(lane) * channels)
+            for k, values in enumerate(lane_sums):
+                dr.scatter(sums, values, lane + k, mode=dr.ReduceMode.NoConflicts)
+        return np.asarray(sums).reshape(-1, channels)
 
 
 def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarray) -> np.ndarray:

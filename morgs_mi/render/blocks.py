@@ -19,11 +19,20 @@ from math import log2
 import drjit as dr
 import mitsuba as mi
 
-from morgs_mi.core.types import Bool, Float, UInt32
+from morgs_mi.core.arrays import opaque
+from morgs_mi.core.types import Bool, Float, Point2u, UInt32
 from morgs_mi.render.backend import elements, stable_order
 from morgs_mi.render.cut import FARTHEST_CUT
 from morgs_mi.render.projection import Splats
-from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, on_region, quotient_and_rest
+from morgs_mi.render.region import (
+    ACROSS,
+    DOWN,
+    NO_SLOT,
+    DrawnBlocks,
+    Region,
+    on_region,
+    quotient_and_rest,
+)
 from morgs_mi.render.render_config import RenderConfig
 
 # A thousandth of an octave: the block test may accept too many entries, never too few.
@@ -43,7 +52,7 @@ class BlockLists:
     end: UInt32  #: Place past its last word [A].
     first: UInt32  #: First entry of its tile [A].
     order: UInt32  #: Blocks by falling count, roughly [A]: the lanes of a packet finish together.
-    depth_order_of: UInt32  #: Of each splat [N].
+    depth_order_of: UInt32 | None  #: Of each splat [N]; None: it is not needed further.
     # Of each block [A], see `Region`.
     x: UInt32
     y: UInt32
@@ -51,12 +60,14 @@ class BlockLists:
     rows: UInt32
     pitch: UInt32  #: As in `Region`, [1].
     limits: Float | None  #: Image on the region, the depth limit of every pixel; None: none.
+    #: Number of entries that a region's capacity should hold [1]; None: it has no capacity.
+    total: UInt32 | None = None
 
 
 def build_lists(
     splats: Splats,
     columns: list[Float],
-    region: Region,
+    region: DrawnBlocks,
     config: RenderConfig,
     limits: Float | None = None,
 ) -> BlockLists:
@@ -71,31 +82,34 @@ def build_lists(
             compared with.
     """
     N = len(splats)
-    depths = dr.select(splats.valid, splats.depths, dr.inf)
+    # Each splat's first tile, its tiles across, and the number of its tiles in the region.
+    low, high, counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
+    rectangles = _Rectangles(low, high.x - low.x, dr.select(splats.valid, counts, 0))
+    dr.schedule(rectangles)  # by the kernel that the sort begins with
+    depths = dr.select(splats.valid, splats.depth, dr.inf)
     by_depth_order = dr.argsort(depths)
     depth_order_of = dr.empty(mi.UInt32, N)
     dr.scatter(depth_order_of, dr.arange(mi.UInt32, N), by_depth_order, mode=dr.ReduceMode.Permute)
-    # Each splat's first tile, its tiles across, and the number of its tiles in the region.
-    (x0, y0, x1, _), counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
-    rectangles = [x0, y0, x1 - x0, dr.select(splats.valid, counts, 0)]
-    dr.eval(rectangles)
-    tiles = _tile_lists([elements(v, by_depth_order) for v in rectangles], region)
+    tiles = _tile_lists(dr.gather(_Rectangles, rectangles, by_depth_order), region)
 
     records = pack_records([*splats.geometry, *columns], depth_order_of)
     geometry = fetch_record(
         records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N)
     )
     farthest = None if limits is None else _farthest_limits(limits, region)
-    words, first_word, end_word = _block_bits(geometry, tiles, region, config, farthest)
-    begin = elements(first_word, region.tile) * 32 + region.bit
-    end = elements(end_word, region.tile) * 32 + region.bit
+    words, end_word, length = _block_bits(geometry, tiles, region, config, farthest)
+    length = elements(length, region.tile)
+    begin = (elements(end_word, region.tile) - length) * 32 + region.bit
+    end = begin + length * 32
+    if region.capacity is not None:  # the blocks that fill it up list nothing
+        block = dr.arange(mi.UInt32, region.num_blocks)
+        end = dr.select(block < region.section_sizes[0], end, begin)
     first = elements(tiles.first, region.tile)
-    count = _set_bits(words, begin, end)
-    dr.eval(begin, end, first, count)
     # Neighbours stay together if their lengths differ by less than an eighth: they draw the same
     # splats and stop alike.
-    bucket = mi.UInt32(6 * dr.log2(mi.Float(count) + 1))
-    order = dr.detail.block_mkperm(255 - bucket, dr.width(count), 256)  # pyright: ignore[reportArgumentType]
+    bucket = 255 - mi.UInt32(6 * dr.log2(mi.Float(_set_bits(words, begin, end)) + 1))
+    dr.eval(begin, end, first, bucket)
+    order = dr.detail.block_mkperm(bucket, dr.width(bucket), 256)  # pyright: ignore[reportArgumentType]
     return BlockLists(
         records,
         words,
@@ -107,12 +121,14 @@ def build_lists(
         depth_order_of,
         *(region.x, region.y, region.place, region.rows, region.pitch),
         None if limits is None else on_region(limits, region),
+        tiles.total,
     )
 
 
 def touches(splats: Splats, region: Region) -> Bool:
     """Return the mask of the splats with an extent that reaches a block of the region [N]."""
-    return splats.valid & (_cells_within(region.block_table, region, splats, (1, 1))[1] > 0)
+    *_, counts = _cells_within(region.block_table, region, splats, (1, 1))
+    return splats.valid & (counts > 0)
 
 
 def next_entry(
@@ -167,22 +183,32 @@ def fetch_record(
 
 
 @dataclass(frozen=True)
+class _Rectangles:
+    """Tiles that the extent of each splat touches."""
+
+    first: Point2u  #: Column and row of the first one.
+    columns: UInt32  #: Tiles across.
+    count: UInt32  #: Tiles that the region has.
+
+
+@dataclass(frozen=True)
 class _Tiles:
     """The coarse lists: depth orders by tile, the slot of each entry's tile, first and end entry of
-    each slot.
+    each slot, and the number of entries that a capacity should hold.
     """
 
     entries: UInt32
     slots: UInt32
     first: UInt32
     end: UInt32
+    total: UInt32 | None = None
 
 
 def _cells_within(
-    table: UInt32, region: Region, splats: Splats, cell: tuple[int, int]
-) -> tuple[tuple[UInt32, UInt32, UInt32, UInt32], UInt32]:
-    """Return the rectangle (x0, y0, x1, y1) of cells that each splat's extent touches, and its
-    number of set cells.
+    table: UInt32, region: DrawnBlocks, splats: Splats, cell: tuple[int, int]
+) -> tuple[Point2u, Point2u, UInt32]:
+    """Return the first cell (column, row) that each splat's extent touches, the one past the last,
+    and the number of set cells between them.
 
     Args:
         table: summed areas of the cells.
@@ -190,35 +216,30 @@ def _cells_within(
         splats: N splats.
         cell: width and height of a cell in blocks.
     """
-    across = dr.opaque(mi.UInt32, region.across * ACROSS // cell[0])
-    down = dr.opaque(mi.UInt32, region.down * DOWN // cell[1])
-
-    def span(axis: int, cells: UInt32) -> tuple[UInt32, UInt32]:
-        center = dr.detach(splats.shape[axis])
-        half = splats.extent[axis]
-        top = mi.Float(cells)
-        bound = 1.0 / (cell[axis] * region.block[axis])
-        low = dr.clip(dr.floor((center - half) * bound), 0, top)
-        high = dr.clip(dr.floor((center + half) * bound) + 1, 0, top)
-        return mi.UInt32(low), mi.UInt32(high)
-
-    x0, x1 = span(0, across)
-    y0, y1 = span(1, down)
+    across = opaque(mi.UInt32, region.across * ACROSS // cell[0])
+    down = opaque(mi.UInt32, region.down * DOWN // cell[1])
+    per_px = mi.Vector2f(1.0 / (cell[0] * region.block[0]), 1.0 / (cell[1] * region.block[1]))
+    most = mi.Vector2f(across, down)
+    mean = dr.detach(splats.mean)
+    low = mi.Point2u(dr.clip(dr.floor((mean - splats.radius) * per_px), 0, most))
+    high = mi.Point2u(dr.clip(dr.floor((mean + splats.radius) * per_px) + 1, 0, most))
     if splats.view is not None:
-        y0 = y0 + splats.view * down
-        y1 = y1 + splats.view * down
+        low.y += splats.view * down
+        high.y += splats.view * down
     if region.whole:
-        return (x0, y0, x1, y1), (x1 - x0) * (y1 - y0)
+        return low, high, dr.prod(high - low)
 
     def before(x: UInt32, y: UInt32) -> UInt32:
         return elements(table, y * (across + 1) + x)
 
-    return (x0, y0, x1, y1), before(x1, y1) - before(x0, y1) - before(x1, y0) + before(x0, y0)
+    count = before(high.x, high.y) - before(low.x, high.y) - before(high.x, low.y)
+    return low, high, count + before(low.x, low.y)
 
 
-def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
+def _tile_lists(rectangles: _Rectangles, region: DrawnBlocks) -> _Tiles:
     """Enter every depth order into the region's tiles within its rectangle, and sort by tile."""
-    x0, y0, columns, counts = rectangles
+    columns = rectangles.columns
+    counts = rectangles.count
     N = dr.width(counts)
     slots = region.num_tiles
     if N * slots >= 2**32 and (entries := dr.sum(mi.Float64(counts))[0]) >= 2**32:
@@ -228,12 +249,22 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
             "image in several regions."
         )
     end = dr.cumsum(counts)
-    total = int(end[-1])  # the one number that must reach the host: the size of the lists
-    if total == 0:
-        return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
-    slot_at = dr.empty(mi.UInt32, total)
-    depth_order_at = dr.empty(mi.UInt32, total)
-    across = dr.opaque(mi.UInt32, region.across)
+    capacity = region.capacity
+    if capacity is None:
+        total = int(end[-1])  # the one number that must reach the host: the size of the lists
+        if total == 0:
+            return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
+        slot_at = dr.empty(mi.UInt32, total)
+        depth_order_at = dr.empty(mi.UInt32, total)
+    else:
+        # Entries that are not used lie in the last tile, which is beside the view. By a kernel:
+        # Dr.Jit 1.5 cannot replay the sort of an array that it has filled without one.
+        lane = dr.arange(mi.UInt32, capacity)
+        nothing = dr.maximum(lane, capacity - 1) - (capacity - 1)
+        slot_at = nothing + (slots - 1)
+        depth_order_at = nothing & lane
+        dr.eval(slot_at, depth_order_at)
+    across = opaque(mi.UInt32, region.across)
 
     depth_order = dr.arange(mi.UInt32, N)
     mode = dr.ReduceMode.NoConflicts
@@ -241,55 +272,63 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     def enter(place, column, tile, slot_at, depth_order_at):
         slot = tile if region.whole else elements(region.slot_of, tile)
         is_drawn = region.whole or slot != NO_SLOT
-        dr.scatter(slot_at, slot, place, active=is_drawn, mode=mode)
-        dr.scatter(depth_order_at, depth_order, place, active=is_drawn, mode=mode)
+        is_entered = is_drawn if capacity is None else is_drawn & (place < capacity)
+        dr.scatter(slot_at, slot, place, active=is_entered, mode=mode)
+        dr.scatter(depth_order_at, depth_order, place, active=is_entered, mode=mode)
         place = place + 1 if region.whole else dr.select(is_drawn, place + 1, place)
         wrap = column + 1 == columns
         column = dr.select(wrap, 0, column + 1)
         tile = dr.select(wrap, tile + across + 1 - columns, tile + 1)
         return place, column, tile, slot_at, depth_order_at
 
-    state = (end - counts, mi.UInt32(0), y0 * across + x0, slot_at, depth_order_at)
+    first_tile = rectangles.first.y * across + rectangles.first.x
+    state = (end - counts, mi.UInt32(0), first_tile, slot_at, depth_order_at)
     *_, slot_at, depth_order_at = dr.while_loop(
         state, lambda place, *_: place < end, enter, label="tile entries"
     )
     dr.eval(slot_at, depth_order_at)
 
-    perm, slot_at, first, end = sorted_buckets(slot_at, slots)
-    entries = elements(depth_order_at, perm)
-    dr.eval(entries)
-    return _Tiles(entries, slot_at, first, end)
+    total = None if capacity is None else dr.gather(mi.UInt32, end, mi.UInt32(N - 1))
+    entries, slot_at, first, end = sorted_buckets(slot_at, slots, depth_order_at)
+    return _Tiles(entries, slot_at, first, end, total)
 
 
-def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, UInt32]:
-    """Return (permutation that sorts `keys` stably, sorted keys, first place of each bucket, end of
+def sorted_buckets(
+    keys: UInt32, buckets: int, values: UInt32
+) -> tuple[UInt32, UInt32, UInt32, UInt32]:
+    """Return (values sorted stably by their `keys`, sorted keys, first place of each bucket, end of
     each bucket).
     """
-    total = dr.width(keys)
     perm = stable_order(keys, buckets)
     sorted_keys = elements(keys, perm)
-    dr.eval(sorted_keys)
-    first = dr.zeros(mi.UInt32, buckets)
-    end = dr.zeros(mi.UInt32, buckets)
-    j = dr.arange(mi.UInt32, total)
-    is_last = j + 1 == dr.opaque(mi.UInt32, total)
-    next_key = dr.gather(mi.UInt32, sorted_keys, j + 1, active=~is_last)
-    edge = is_last | (next_key != sorted_keys)
-    dr.scatter(end, j + 1, sorted_keys, active=edge)
-    dr.scatter(first, j + 1, next_key, active=edge & ~is_last)
-    dr.eval(first, end)
-    return perm, sorted_keys, first, end
+    sorted_values = elements(values, perm)
+    dr.eval(sorted_keys, sorted_values)
+    bucket = dr.arange(mi.UInt32, buckets)
+    first = _first_place(sorted_keys, bucket)
+    end = _first_place(sorted_keys, bucket + 1)
+    return sorted_values, sorted_keys, first, end
+
+
+def _first_place(sorted_keys: UInt32, least: UInt32) -> UInt32:
+    """Return the place of the first key that is at least `least`, by halving the rest."""
+
+    def halve(low, high):
+        middle = low + (high - low) // 2
+        is_less = elements(sorted_keys, middle) < least
+        return dr.select(is_less, middle + 1, low), dr.select(is_less, high, middle)
+
+    state = (mi.UInt32(0), opaque(mi.UInt32, dr.width(sorted_keys)))
+    return dr.while_loop(state, lambda low, high: low < high, halve, label="first place")[0]
 
 
 def _block_bits(
     geometry: list[Float],
     tiles: _Tiles,
-    region: Region,
+    region: DrawnBlocks,
     config: RenderConfig,
     farthest_limits: Float | None,
 ) -> tuple[UInt32, UInt32, UInt32]:
-    """Return (words, first word of each tile, end word of each tile) for the geometry of the
-    entries.
+    """Return (words, end word of each tile, number of its words) for the geometry of the entries.
 
     Bit k of word 32 w + b is set if block b of the tile is touched by entry 32 w + k, both counted
     from the tile's first.
@@ -297,9 +336,8 @@ def _block_bits(
     bw, bh = region.block
     num_tiles = region.num_tiles
     length = (tiles.end - tiles.first + 31) // 32
+    dr.eval(tiles.first, tiles.end, length)
     end_word = dr.cumsum(length)
-    first_word = end_word - length
-    dr.eval(first_word, end_word)
     num_words = dr.width(tiles.entries) // 32 + num_tiles  # at most one word per tile is not full
 
     slot = tiles.slots
@@ -350,6 +388,14 @@ def _block_bits(
                 touches &= ahead[i]
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
+    # The tile of each word, and the word's entries.
+    word = dr.arange(mi.UInt32, num_words)
+    tile = dr.minimum(_first_place(end_word, word + 1), opaque(mi.UInt32, num_tiles - 1))
+    first = elements(tiles.first, tile)
+    end = elements(tiles.end, tile)
+    place = first + 32 * (word - elements(end_word, tile) + elements(length, tile))
+    entries = [place + k for k in range(32)]
+    is_listed = [entry < end for entry in entries]
     # A depth limit may cut the entries that would hide later ones: no entry is omitted for its
     # transmittance.
     if farthest_limits is None:
@@ -363,33 +409,29 @@ def _block_bits(
                 v = c * y
                 farthest = dr.maximum(farthest, dr.fma(u, u, v * v))
         alpha = dr.select(farthest < reach - 2 * _TEST_SLACK, dr.exp2(log2_opacity - farthest), 0)
-        log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
+        log2_transmitted = mi.Float64(dr.log2(1 - dr.minimum(alpha, config.alpha_max)))
         dr.eval(mask, log2_transmitted)
-        behind = dr.prefix_sum(mi.Float64(log2_transmitted))
-        first = elements(tiles.first, slot)
-        log2_transmittance = behind - dr.gather(mi.Float64, behind, first)
+        behind = dr.prefix_sum(log2_transmitted)
+        start = dr.gather(mi.Float64, behind, first, is_listed[0])
         # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
         least = log2(max(config.stop_transmittance, 1e-38)) - 0.5
-        mask = dr.select(log2_transmittance < least, 0, mask)
-    dr.eval(mask)
-    place = elements(first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
-    masks = dr.zeros(mi.UInt32, num_words * 32)
-    dr.scatter(masks, mask, place - elements(tiles.first, slot), mode=dr.ReduceMode.NoConflicts)
-    dr.eval(masks)
-    word = dr.arange(mi.UInt32, num_words) * 32
-    rows = _transposed([elements(masks, word + k) for k in range(32)])
+        for k, entry in enumerate(entries):
+            log2_transmittance = dr.gather(mi.Float64, behind, entry, is_listed[k]) - start
+            is_listed[k] &= ~(log2_transmittance < least)
+    pairs = zip(entries, is_listed, strict=True)
+    masks = [dr.gather(mi.UInt32, mask, entry, active) for entry, active in pairs]
     words = dr.empty(mi.UInt32, num_words * 32)
-    for k, row in enumerate(rows):
-        dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
+    for k, row in enumerate(_transposed(masks)):
+        dr.scatter(words, row, word * 32 + k, mode=dr.ReduceMode.NoConflicts)
     dr.eval(words)
-    return words, first_word, end_word
+    return words, end_word, length
 
 
-def _farthest_limits(limits: Float, region: Region) -> Float:
+def _farthest_limits(limits: Float, region: DrawnBlocks) -> Float:
     """Return the largest depth limit in each block of a region's tiles [tiles ACROSS DOWN]."""
     lane = dr.arange(mi.UInt32, region.width * region.height)
     row, column = quotient_and_rest(lane, region.width)
-    across = dr.opaque(mi.UInt32, region.across)
+    across = opaque(mi.UInt32, region.across)
     x = column // region.block[0]
     y = row // region.block[1]
     tile = y // DOWN * across + x // ACROSS

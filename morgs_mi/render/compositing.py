@@ -8,6 +8,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.core.arrays import concatenated, opaque
 from morgs_mi.core.types import Float
 from morgs_mi.render.backend import elements, sections
 from morgs_mi.render.blocks import BlockLists, pack_records
@@ -19,13 +20,13 @@ from morgs_mi.render.loops import (
     record_packets,
     tangent,
 )
-from morgs_mi.render.region import NO_SLOT, Region, quotient, quotient_and_rest
+from morgs_mi.render.region import NO_SLOT, DrawnBlocks, quotient, quotient_and_rest
 
 
 def blend(
     geometry: tuple[Float, ...],
     channels: list[tuple[Float, ...]],
-    region: Region,
+    region: DrawnBlocks,
     lists: BlockLists,
     layout: Layout,
     absolute: tuple[Float, ...] = (),
@@ -36,7 +37,8 @@ def blend(
         geometry: see `Splats.geometry`, floats [N].
         channels: the columns of each channel, floats [N].
         region: the blocks that are drawn.
-        lists: the splats that touch them, built from the same geometry and columns.
+        lists: the splats that touch them, built from the same geometry and columns, and perhaps
+            further splats after them, which get no gradients.
         layout: sizes of the channels, whether their gradients reach the weights, and cut-offs.
         absolute: two columns that are not read, and whose gradients are the sums of the absolute
             gradients of the means over the pixels; none without `layout.absolute`.
@@ -47,23 +49,30 @@ def blend(
         used further. Differentiable in `geometry` and `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
-    return dr.custom(_Blend, [*geometry, *columns, *absolute], region, lists, layout)
+    return dr.custom(_Blend, [*geometry, *columns, *absolute], _Constants(region, lists, layout))
 
 
-class _Blend(dr.CustomOp):
-    def eval(
-        self,
-        values: list[Float],
-        region: Region,
-        lists: BlockLists,
-        layout: Layout,
-    ) -> list[Float]:
-        # The lists' records contain the values already: they are arguments only to be
-        # differentiated.
+class _Constants:
+    """Arguments of a blend that have no gradients.
+
+    Not a dataclass: `dr.custom` copies those, and so checks their settings in every step.
+    """
+
+    def __init__(self, region: DrawnBlocks, lists: BlockLists, layout: Layout) -> None:
         self.region = region
         self.lists = lists
         self.layout = layout
-        self.images = recorded(primal, layout)(lists, self._allocated())
+
+
+class _Blend(dr.CustomOp):
+    def eval(self, values: list[Float], constants: _Constants) -> list[Float]:
+        # The lists' records contain the values already: they are arguments only to be
+        # differentiated.
+        self.values = values
+        self.region = constants.region
+        self.lists = constants.lists
+        self.layout = layout = constants.layout
+        self.images = recorded(primal, layout)(self.lists, self._allocated())
         return self._outputs(self.images)
 
     def backward(self) -> None:
@@ -74,13 +83,18 @@ class _Blend(dr.CustomOp):
             *grads, alpha, coverage = grads
             grads = [*grads, alpha + coverage]
         grads = [padded(v, self.region, size) for v, size in zip(grads, layout.sizes, strict=True)]
-        columns = record_gradients(self.lists, layout, self.images, grads)
+        count = dr.width(self.values[0])
+        columns = record_gradients(self.region, self.lists, layout, self.images, grads, count)
         missing = layout.geometry + layout.columns + 2 * layout.absolute - len(columns)
         self.set_grad_in("values", [mi.Float(0)] * missing + columns)
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         grads = grads[: self.layout.geometry + self.layout.columns]
+        if missing := dr.width(self.lists.depth_order_of) - dr.width(self.values[0]):
+            none = dr.zeros(mi.Float, missing)
+            zero = dr.zeros(mi.Float, dr.width(self.values[0]))
+            grads = [concatenated([grad + zero, none]) for grad in grads]
         tangents = pack_records(grads, self.lists.depth_order_of)
         images = recorded(tangent, self.layout)(self.lists, tangents, self._allocated())
         self.set_grad_out(self._outputs(images))
@@ -89,7 +103,9 @@ class _Blend(dr.CustomOp):
         """Return memory for the images: a frozen function cannot allocate arrays of a size that it
         computes.
         """
-        return [dr.empty(mi.Float, self.region.num_pixels * size) for size in self.layout.sizes]
+        images = [dr.empty(mi.Float, self.region.num_pixels * size) for size in self.layout.sizes]
+        dr.make_opaque(images)  # Dr.Jit records a function again for arrays without memory
+        return images
 
     def _outputs(self, images: list[Float]) -> list[Float]:
         """Return the images without the padding to whole blocks, and alpha twice."""
@@ -101,59 +117,65 @@ class _Blend(dr.CustomOp):
 
 
 def record_gradients(
-    lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
+    region: DrawnBlocks,
+    lists: BlockLists,
+    layout: Layout,
+    images: list[Float],
+    grads: list[Float],
+    count: int,
 ) -> list[Float]:
     """Return the gradients of the geometry (if the layout reaches it) and the columns, and the
-    absolute gradients of the means (if the layout has them), floats [N].
+    absolute gradients of the means (if the layout has them), floats [N'].
 
     The gradients of columns that do not reach the weights are the sums of `grads`, weighted by each
     splat's blend weights; they do not depend on `images`.
 
     Args:
-        lists: the splats that touch the blocks.
+        region: the blocks.
+        lists: the splats that touch them.
         layout: description of the blend.
         images: flat image of each channel on the region.
         grads: their gradients.
+        count: N', the number of the first splats, whose gradients are returned.
     """
     N = dr.width(lists.depth_order_of)
     stride = 4 * record_packets(layout)
-    num_blocks = dr.width(lists.order)
-    launches, num_sections, lanes = sections(num_blocks)
+    launches, num_sections, lanes = sections(dr.width(lists.order))
+    num_blocks, blocks_per_section = region.section_sizes
+    if num_sections * lanes == dr.width(lists.order) and num_sections > 1:
+        # A recording distinguishes which arrays have the same size: as many lanes as blocks would
+        # be another one.
+        lanes += 32
     sums = dr.opaque(mi.Float, 0, num_sections * N * stride)
     # Dr.Jit adds in the order of the lanes within a section; the sections are added in theirs.
-    lane = dr.arange(mi.UInt32, num_sections * lanes)
-    first_record = dr.opaque(mi.UInt32, N) * quotient(lane, lanes)
-    dr.eval(first_record)
+    section, within = quotient_and_rest(dr.arange(mi.UInt32, num_sections * lanes), lanes)
+    first_record = opaque(mi.UInt32, N) * section
     for launch in range(launches):
-        place = lane + dr.opaque(mi.UInt32, launch * num_sections * lanes)
-        is_block = place < dr.opaque(mi.UInt32, num_blocks)
+        place = (section + opaque(mi.UInt32, launch * num_sections)) * blocks_per_section + within
+        is_block = (within < blocks_per_section) & (place < num_blocks)
         order = dr.gather(mi.UInt32, lists.order, place, is_block)
         order = dr.select(is_block, order, NO_SLOT)
-        dr.eval(order)
-        section = replace(lists, order=order)
-        sums = recorded(adjoint, layout)(section, images, grads, first_record, sums)
-    place = dr.arange(mi.UInt32, N * stride)
-    parts = [
-        elements(sums, place + dr.opaque(mi.UInt32, k * N * stride)) for k in range(num_sections)
-    ]
-    sums = sum(parts[1:], parts[0])
-    dr.eval(sums)
-    lane = lists.depth_order_of * stride
+        part = replace(lists, order=order, depth_order_of=None, total=None)
+        sums = recorded(adjoint, layout)(part, images, grads, first_record, sums)
+    lane = dr.gather(mi.UInt32, lists.depth_order_of, dr.arange(mi.UInt32, count)) * stride
+    section_size = opaque(mi.UInt32, N * stride)
+    firsts = [lane + k * section_size for k in range(num_sections)]
     start = 0 if layout.reaches_weights else layout.geometry
     stop = layout.geometry + layout.columns + 2 * layout.absolute
-    return [elements(sums, lane + k) for k in range(start, stop)]
+    parts = ([elements(sums, first + k) for first in firsts] for k in range(start, stop))
+    return [sum(rest, total) for total, *rest in parts]
 
 
-def _cropped(image: Float, region: Region, size: int) -> Float:
+def _cropped(image: Float, region: DrawnBlocks, size: int) -> Float:
     """Return a flat image without the columns of pixels that pad it to whole blocks."""
     if not region.whole or region.row == region.width:
         return image
     lane = dr.arange(mi.UInt32, region.width * region.height * size)
     row = quotient(lane, region.width * size)
-    return elements(image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
+    return elements(image, lane + row * opaque(mi.UInt32, (region.row - region.width) * size))
 
 
-def padded(image: Float, region: Region, size: int) -> Float:
+def padded(image: Float, region: DrawnBlocks, size: int) -> Float:
     """Return a flat image padded to whole blocks, or zeros for a literal 0: the transpose of
     `_cropped`.
     """
@@ -163,7 +185,7 @@ def padded(image: Float, region: Region, size: int) -> Float:
     if not region.whole or region.row == region.width:
         # In memory allocated by Dr.Jit (see `memory.owned_copy`); a product fuses with the kernel
         # of the gradient.
-        return image * dr.opaque(mi.Float, 1)
+        return image * opaque(mi.Float, 1)
     row, column = quotient_and_rest(dr.arange(mi.UInt32, total), region.row * size)
-    width = dr.opaque(mi.UInt32, region.width * size)
+    width = opaque(mi.UInt32, region.width * size)
     return dr.gather(mi.Float, image, row * width + column, active=column < width)

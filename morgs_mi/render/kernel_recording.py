@@ -33,6 +33,13 @@ render_lock = RLock()
 `dr.forward` if another thread renders at the same time.
 """
 
+_recordings: list[Any] = []  # every frozen function of this process
+
+
+def num_recordings() -> int:
+    """Return the number of recordings that this process has made."""
+    return sum(function.n_recordings for function in _recordings)
+
 
 def with_render_lock(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function holding `render_lock` while it runs."""
@@ -45,7 +52,7 @@ def with_render_lock(function: Callable[P, R]) -> Callable[P, R]:
     return locked
 
 
-def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
+def recorded(function: Callable[..., Jit], *static: object) -> Callable[..., Jit]:
     """Return a recording of `function` with its first arguments fixed to `static`.
 
     The other arguments are Dr.Jit arrays, or dataclasses of them. There is one recording per
@@ -55,7 +62,7 @@ def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
     size.
     """
 
-    def call(*arguments: Any) -> Jit:
+    def call(*arguments: Jit) -> Jit:
         classes = tuple(type(a) if is_dataclass(a) else None for a in arguments)
         # Dr.Jit holds its own lock while it inspects the arguments. For a dataclass that runs
         # Python code, in which another thread can get the interpreter's lock and then wait for
@@ -79,7 +86,7 @@ def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
 def _recording(
     function: Callable[..., Jit],
     variant: str,
-    static: tuple[Any, ...],
+    static: tuple[object, ...],
     classes: tuple[type | None, ...],
 ) -> Callable[..., Jit]:
     # Dr.Jit also inspects the variables of a closure; what is in a `partial` it compares by
@@ -87,14 +94,16 @@ def _recording(
     rebuilt = partial(_rebuilt, function, static, classes)
     # A long fit meets new combinations of sizes again and again; the least used recordings are
     # evicted.
-    return dr.freeze(lambda *plain: rebuilt(plain), limit=MOST_RECORDINGS, warn_after=2**31 - 1)
+    frozen = dr.freeze(lambda *plain: rebuilt(plain), limit=MOST_RECORDINGS, warn_after=2**31 - 1)
+    _recordings.append(frozen)
+    return frozen
 
 
 def _rebuilt(
     function: Callable[..., Jit],
-    static: tuple[Any, ...],
+    static: tuple[object, ...],
     classes: tuple[type | None, ...],
-    plain: tuple[Any, ...],
+    plain: tuple[Jit, ...],
 ) -> Jit:
     """Return the result of `function` for arguments with their dataclasses converted to dicts."""
     return function(*static, *(c(**a) if c else a for a, c in zip(plain, classes, strict=True)))

@@ -26,16 +26,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import log2, sqrt
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import concatenated, from_numpy
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
+from morgs_mi.core.types import (
+    Bool,
+    Color3f,
+    Float,
+    Jit,
+    Matrix3d,
+    Matrix3f,
+    Point2f,
+    Point3d,
+    Point3f,
+    Tensor,
+    UInt32,
+    Vector2f,
+    Vector3d,
+    Vector3f,
+    Vector4f,
+)
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.render_config import RenderConfig
 
@@ -50,80 +65,249 @@ _THINNEST = 1e-6
 
 
 @dataclass(frozen=True)
-class Splats:
-    """Projected Gaussians, one Dr.Jit float [N] per number."""
+class DepthProfile:
+    """Gaussians in depth along the ray of a pixel (see module docstring), world units."""
 
-    #: (mean_x, mean_y, a, b, c, log2_opacity), the differentiable geometry (see module docstring).
-    shape: tuple[Float, ...]
+    mean: Float  #: Depth z at the centre of the splat.
+    slope: Vector2f  #: (gx, gy), the change of that depth per px.
+    r_sigma: Float  #: Inverse standard deviation.
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N projected Gaussians."""
+
+    mean: Point2f  #: Centre, px.
+    #: (a, b, c), the Cholesky factor of the conic times log2(e) / 2 (see module docstring), 1 / px.
+    conic: Vector3f
+    log2_opacity: Float  #: Logarithm of the opacity to base 2.
     channels: dict[str, tuple[Float, ...]]  #: Blended values, by channel name.
-    depths: Float  #: Camera-space z in world units, detached.
-    #: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if
-    #: culled.
-    extent: tuple[Float, Float]
+    depth: Float  #: Camera-space z in world units, detached.
+    #: Half width and half height in px of the box where alpha >= alpha_min, detached; 0 if culled.
+    radius: Vector2f
     valid: Bool  #: False where culled: behind the near plane, too faint, or not finite.
     #: False where an attribute, or a value computed from it, is not finite, or a blended one is
     #: above 1e18.
-    finite: Bool
-    #: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module
-    #: docstring), world units, differentiable; empty if no depth limit cuts the splats.
-    profile: tuple[Float, ...] = ()
+    finite: Bool | None = None
+    profile: DepthProfile | None = None  #: None if no depth limit cuts the splats.
     #: Index of the view that each splat belongs to, in a region of several views; None: there is
     #: one view.
     view: UInt32 | None = None
 
     def __len__(self) -> int:
-        return dr.width(self.depths)
+        return dr.width(self.depth)
 
     @property
     def geometry(self) -> tuple[Float, ...]:
-        """The differentiable numbers that determine a splat's alpha at a pixel: `shape` and
-        `profile`.
-        """
-        return self.shape + self.profile
+        """The differentiable numbers that determine a splat's alpha at a pixel."""
+        shape = (*self.mean, *self.conic, self.log2_opacity)
+        cut = self.profile
+        return shape if cut is None else (*shape, cut.mean, *cut.slope, cut.r_sigma)
 
-    def concatenated_with(self, other: Splats) -> Splats:
+    @property
+    def _present(self) -> dict[str, Jit]:
+        """The fields that are not None."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    def at(self, rows: UInt32) -> Splats:
+        """Return the splats with these indices [M]."""
+        return Splats(**dr.gather(dict, self._present, rows))
+
+    def concatenated_with(self, *others: Splats) -> Splats:
         """Return these splats, then the others, which are 0 in the channels that they lack."""
+        parts = [self._present, *map(self._fields_of, others)]
+        # Otherwise the kernel of each column would project all splats again.
+        dr.eval(parts)
+        return Splats(**concatenated(parts))
+
+    def followed_by(self, others: Splats, first: UInt32, count: UInt32, size: int) -> Splats:
+        """Return these splats, then some others, which are not copied before: `count` of them from
+        an index on, and splats that are not valid up to a `size`.
+        """
+        own = self._present
+        dr.eval(own)
+        lane = dr.arange(mi.UInt32, len(self) + size)
+        is_own = lane < len(self)
+        place = lane - len(self)
+        is_other = ~is_own & (place < count)
+        own = dr.gather(dict, own, lane, is_own)
+        following = dr.gather(dict, self._fields_of(others), first + place, is_other)
+        return Splats(**dr.select(is_own, own, following))
+
+    def _fields_of(self, others: Splats) -> dict[str, Jit]:
+        """Return those fields of other splats that these have; channels that they lack are 0."""
         channels = {
-            name: other.channels.get(name) or tuple(dr.zeros(mi.Float, len(other)) for _ in columns)
+            name: others.channels.get(name)
+            or tuple(dr.zeros(mi.Float, len(others)) for _ in columns)
             for name, columns in self.channels.items()
         }
-        values, other_values = (
-            {name: value for name, value in vars(splats).items() if value is not None}
-            for splats in (self, replace(other, channels=channels))
-        )
-        return Splats(**concatenated(values, other_values))
+        return {**{name: vars(others)[name] for name in self._present}, "channels": channels}
 
 
 @dataclass(frozen=True)
 class AttachedCamera(Camera):
-    """Camera with intrinsics that get gradients."""
+    """Camera with intrinsics that get gradients, in pixels, with the values of `K`."""
 
-    intrinsics: tuple[Float, ...] = ()  #: fx, fy, cx and cy in pixels, with the values of `K`.
+    focal: Vector2f | None = None  #: fx and fy.
+    center: Point2f | None = None  #: cx and cy.
 
 
 @dataclass(frozen=True)
-class Views:
-    """Several cameras, and the one that each lane projects to."""
+class Pose:
+    """Map x = R mean + t from the world to a camera, in double precision."""
 
-    cameras: Sequence[Camera]  #: The cameras.
-    view: UInt32  #: Index of the camera of each lane.
+    rotation: Matrix3d  #: R.
+    translation: Vector3d  #: t, world units.
+    position: Point3d  #: Centre of the camera, -R't.
+    axes: Matrix3f  #: R in single precision.
+
+    @staticmethod
+    def of(numbers: Sequence[Float]) -> Pose:
+        """Return the pose with the first three rows of a `viewmat` [12]."""
+        R = mi.Matrix3f64(numbers[0:3], numbers[4:7], numbers[8:11])
+        t = mi.Vector3d(numbers[3::4])
+        right, down, forward = R
+        position = mi.Point3d(-(right * t.x + down * t.y + forward * t.z))
+        return Pose(R, t, position, mi.Matrix3f(R))
+
+    def transformed(self, points: Point3d) -> Point3f:
+        """Return points in camera space, in single precision."""
+        x_axis, y_axis, z_axis = self.rotation.T
+        inner = dr.fma(z_axis, points.z, self.translation)
+        return mi.Point3f(dr.fma(x_axis, points.x, dr.fma(y_axis, points.y, inner)))
 
 
-def concatenated(a: Jit, b: Jit) -> Jit:
-    """Return two arrays, or trees of arrays, end to end; `dr.concat` would compile a kernel for
-    every length.
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera without its pose."""
+
+    focal: Vector2f  #: fx and fy, px.
+    center: Point2f  #: cx and cy, px.
+    low: Vector2f  #: Least x/z and y/z at which the projection is linearised.
+    high: Vector2f  #: Largest ones.
+    near: Float  #: Depth of the near plane, world units.
+    delay: Float  #: Frames from the timestamp to the middle row.
+    readout: Float  #: Frames from the first to the last row.
+    height: Float  #: Of the image, px.
+
+    @staticmethod
+    def of(numbers: Sequence[Float]) -> Intrinsics:
+        """Return the intrinsics with the numbers of `intrinsics_of` [12]."""
+        return Intrinsics(
+            mi.Vector2f(numbers[0:2]),
+            mi.Point2f(numbers[2:4]),
+            mi.Vector2f(numbers[4:6]),
+            mi.Vector2f(numbers[6:8]),
+            *numbers[8:],
+        )
+
+    def frames_late(self, point: Point3f) -> Float:
+        """Return how many frames after the timestamp a point in camera space is seen."""
+        row = dr.fma(self.focal.y, point.y / dr.maximum(point.z, self.near), self.center.y)
+        return dr.fma(self.readout, dr.clip(row / self.height, 0, 1) - 0.5, self.delay)
+
+
+@dataclass(frozen=True)
+class TracedCamera:
+    """A camera in memory: with Python numbers, every camera would compile its own kernels."""
+
+    pose: Pose
+    intrinsics: Intrinsics
+    is_late: bool = False  #: Whether it sees some pixels before or after the timestamp.
+    view: UInt32 | None = None  #: Index of each lane's camera; None: there is one camera.
+
+    @staticmethod
+    def of(camera: Camera) -> TracedCamera:
+        """Return a camera, attached to the gradients of a Dr.Jit `viewmat` and of an
+        `AttachedCamera`.
+        """
+        viewmat: Tensor = camera.viewmat
+        if dr.is_tensor_v(viewmat):
+            pose = Pose.of(_row_of(mi.Float64(viewmat.array)))
+        else:
+            pose = _pose(mi.variant(), tuple(np.asarray(viewmat, float).flat[:12]))
+        intrinsics = _intrinsics(mi.variant(), tuple(intrinsics_of(camera)))
+        if isinstance(camera, AttachedCamera):
+            focal = dr.replace_grad(intrinsics.focal, camera.focal)
+            center = dr.replace_grad(intrinsics.center, camera.center)
+            intrinsics = replace(intrinsics, focal=focal, center=center)
+        return TracedCamera(pose, intrinsics, bool(camera.delay or camera.readout))
+
+    @staticmethod
+    def of_arrays(pose: Float, intrinsics: Float) -> TracedCamera:
+        """Return a camera without delay and readout from arguments of a recording.
+
+        Args:
+            pose: the first three rows of its `viewmat`, in double precision [12].
+            intrinsics: see `intrinsics_of` [12].
+        """
+        return TracedCamera(Pose.of(_row_of(pose)), Intrinsics.of(_row_of(intrinsics)))
+
+
+@dataclass(frozen=True)
+class TracedCameras:
+    """Several cameras in memory, without gradients."""
+
+    poses: Float  #: The first three rows of their `viewmat`, in double precision [12 V].
+    intrinsics: Float  #: See `intrinsics_of` [12 V].
+    is_late: bool  #: Whether one of them sees some pixels before or after the timestamp.
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> TracedCameras:
+        """Return V cameras."""
+        return TracedCameras(
+            from_numpy(mi.Float64, [np.ravel(camera.viewmat)[:12] for camera in cameras]),
+            from_numpy(mi.Float, [intrinsics_of(camera) for camera in cameras]),
+            any(camera.delay or camera.readout for camera in cameras),
+        )
+
+    def of_each(self, view: UInt32) -> TracedCamera:
+        """Return the camera of each lane, by its index."""
+        pose = Pose.of(_row_of(self.poses, view))
+        intrinsics = Intrinsics.of(_row_of(self.intrinsics, view))
+        return TracedCamera(pose, intrinsics, self.is_late, view)
+
+
+def intrinsics_of(camera: Camera) -> np.ndarray:
+    """Return fx, fy, cx, cy, the least x/z and y/z at which the projection is linearised, the
+    largest ones, near, delay, readout and height [12].
     """
-    count = dr.opaque(mi.UInt32, dr.width(a))
-    lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
-    mode = dr.ReduceMode.NoConflicts
-    first = lane < count
-    front = dr.gather(type(a), a, lane, active=first, mode=mode)
-    return dr.select(first, front, dr.gather(type(b), b, lane - count, active=~first, mode=mode))
+    focal = np.diag(camera.K)[:2]
+    center = camera.K[:2, 2]
+    size = np.array(camera.size)
+    # 30 % of the half view on every side.
+    margin = 0.15 * size / focal
+    low = -center / focal - margin
+    high = (size - center) / focal + margin
+    others = [camera.near, camera.delay, camera.readout, camera.height]
+    return np.concatenate([focal, center, low, high, others])
+
+
+# The views of a rig are projected to again and again.
+@lru_cache(maxsize=1024)
+def _pose(variant: str | None, numbers: tuple[float, ...]) -> Pose:
+    """Return a pose in memory."""
+    pose = Pose.of(_row_of(from_numpy(mi.Float64, numbers)))
+    dr.eval(pose)
+    return pose
+
+
+@lru_cache(maxsize=1024)
+def _intrinsics(variant: str | None, numbers: tuple[float, ...]) -> Intrinsics:
+    """Return intrinsics in memory."""
+    intrinsics = Intrinsics.of(_row_of(from_numpy(mi.Float, numbers)))
+    dr.eval(intrinsics)
+    return intrinsics
+
+
+def _row_of(rows: Jit, index: UInt32 | int = 0) -> tuple[Jit, ...]:
+    """Return the 12 numbers of one of some rows in each lane."""
+    return tuple(dr.gather(type(rows), rows, mi.UInt32(index * 12 + k)) for k in range(12))
 
 
 def project(
     gaussians: ActivatedGaussians,
-    camera: Camera | Views,
+    camera: Camera | TracedCamera,
     channels: tuple[str, ...],
     config: RenderConfig,
     rows: UInt32 | None = None,
@@ -133,8 +317,7 @@ def project(
 
     Args:
         gaussians: N Gaussians with activated attributes.
-        camera: the view; a Dr.Jit `viewmat` receives gradients. Or several views, without
-            gradients.
+        camera: the view; a Dr.Jit `viewmat` receives gradients.
         channels: names of `channel_sizes()`, ``features``, or ``profile``: the splats get a
             `profile`.
         config: cut-offs.
@@ -146,85 +329,62 @@ def project(
     """
     if rows is None:
         rows = dr.arange(mi.UInt32, int(dr.prod(gaussians.means.shape[:1])))
-    means = gaussians.rows("means", rows)
-    quats = mi.Vector4f(*gaussians.rows("quats", rows))
-    scales = mi.Vector3f(*gaussians.rows("scales", rows))
+    world = mi.Point3d(mi.Point3f(gaussians.rows("means", rows)))
+    quats = mi.Vector4f(gaussians.rows("quats", rows))
+    scales = mi.Vector3f(gaussians.rows("scales", rows))
     (opacities,) = gaussians.rows("opacities", rows)
-    R, pose, eye = _pose(camera)
-    fx, fy, cx, cy, near, *limits, delay, readout, height = _intrinsics(camera)
-    cameras = camera.cameras if isinstance(camera, Views) else (camera,)
+    camera = TracedCamera.of(camera) if isinstance(camera, Camera) else camera
+    pose = camera.pose
+    lens = camera.intrinsics
+    R = pose.axes
 
-    world = [mi.Float64(v) for v in means]
-    if any(c.delay or c.readout for c in cameras) and gaussians.motion is not None:
-        _, y, z = _transformed(world, pose)
-        row = dr.fma(fy, y / dr.maximum(z, near), cy)
-        # Frames after the timestamp.
-        late = dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)
-        world = [
-            v + mi.Float64(late * d)
-            for v, d in zip(world, gaussians.rows("motion", rows), strict=True)
-        ]
-    x, y, z = _transformed(world, pose)
-    probe = dr.detach(x + y + z)
-    front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
-    x = dr.select(front, x, 0)
-    y = dr.select(front, y, 0)
-    z = dr.select(front, z, 1)
+    if camera.is_late and gaussians.motion is not None:
+        late = lens.frames_late(pose.transformed(world))
+        motion = mi.Vector3f(gaussians.rows("motion", rows))
+        world += mi.Vector3d(late * motion)  # pyright: ignore[reportOperatorIssue]
+    point = pose.transformed(world)
+    probe = dr.detach(dr.sum(point))
+    front = dr.detach((point.z >= lens.near) & (dr.max(dr.abs(point)) < FARTHEST))
+    point = dr.select(front, point, mi.Point3f(0, 0, 1))
+    xy = point.xy
+    z = point.z
     rz = dr.rcp(z)
-    mean_x = dr.fma(fx, x * rz, cx)
-    mean_y = dr.fma(fy, y * rz, cy)
+    mean = dr.fma(lens.focal, xy * rz, lens.center)
 
-    u0, u1, w, r_focal, r_scale = _screen_axes(
-        x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits
-    )
-    r_size = r_focal * r_scale
+    axes = _screen_axes(xy * rz, lens.focal * rz, lens, R, quats, scales)
+    r_size = axes.r_focal * axes.r_scale
     eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
-    xx = dr.dot(u0, u0)
-    yy = dr.dot(u1, u1)
-    xy = dr.dot(u0, u1)
-    # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for
-    # needles.
-    det_exact = dr.squared_norm(dr.cross(u0, u1))
-    det = det_exact + eps * (xx + yy) + eps * eps
-    xx = xx + eps
-    yy = yy + eps
-    r_det = dr.rsqrt(det)
-    r_yy = dr.rsqrt(yy)
+    covariance = _screen_covariance(axes, eps)
+    r_det = dr.rsqrt(covariance.det)
+    r_yy = dr.rsqrt(covariance.yy)
     s = sqrt(_HALF_LOG2E) * r_size
-    a = s * yy * r_yy * r_det
-    b = -s * xy * r_yy * r_det
-    c = s * r_yy
+    conic = mi.Vector3f(
+        s * covariance.yy * r_yy * r_det, -s * covariance.xy * r_yy * r_det, s * r_yy
+    )
     log2_opacity = dr.log2(dr.maximum(opacities, _FAINTEST))
     if config.antialiased:
-        log2_opacity += 0.5 * dr.log2(dr.maximum(det_exact / det, _FAINTEST**2))
-    shape = (mean_x, mean_y, a, b, c, log2_opacity)
-    line = (
-        _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale)
-        if "profile" in channels
-        else ()
-    )
+        share = covariance.det_exact / covariance.det
+        log2_opacity += 0.5 * dr.log2(dr.maximum(share, _FAINTEST**2))
+    profile = _depth_profile(z, axes, covariance) if "profile" in channels else None
 
     blended: dict[str, tuple[Float, ...]] = {}
     largest = mi.Float(0)
     attributes = attribute_channels()
     for name in channels:
         if name == "color":
-            direction = dr.select(
-                front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1
-            )
+            direction = dr.select(front, mi.Vector3f(world - pose.position), 1)
             coeffs = gaussians.rows("sh_coeffs", rows)
             largest = _largest(largest, coeffs)
-            blended[name] = _colors(direction, coeffs)
+            blended[name] = tuple(_colors(direction, coeffs))
         elif name == "depth":
             blended[name] = (z,)
         elif name in ("motion", "guided_motion"):
-            motion = gaussians.rows("motion", rows)
+            motion = mi.Vector3f(gaussians.rows("motion", rows))
             if name == "guided_motion" and getattr(gaussians, "offset", None) is not None:
                 # Without the learned offset (eq. 8).
-                offset = gaussians.rows("offset", rows)
-                motion = [a - b for a, b in zip(motion, offset, strict=True)]
-            blended[name] = _screen_motion(
-                motion, (x * rz, y * rz, z), (fx, fy), near, R, config.first_order_motion
+                motion = motion - mi.Vector3f(gaussians.rows("offset", rows))
+            blended[name] = tuple(
+                _screen_motion(motion, xy * rz, z, lens, R, config.first_order_motion)
             )
         elif name == "features":
             blended[name] = tuple(tensor_rows(features, rows))
@@ -233,20 +393,27 @@ def project(
 
     # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
-    xx = dr.detach(xx)
-    yy = dr.detach(yy)
-    # Not finite where any of these values is not.
-    probe += sum(
-        dr.detach(v) for v in (*shape, *line, *(v for values in blended.values() for v in values))
+    variances = dr.detach(mi.Vector2f(covariance.xx, covariance.yy))
+    radius = dr.sqrt(variances * reach) / mi.Vector2f(s)  # pyright: ignore
+    splats = Splats(
+        mean,
+        conic,
+        log2_opacity,
+        blended,
+        dr.detach(z),
+        radius,
+        valid=front & (reach > 0),  # pyright: ignore[reportOperatorIssue]
+        profile=profile,
+        view=camera.view,
     )
+    # Not finite where any of these values is not.
+    values = [v for values in blended.values() for v in values]
+    probe += sum(dr.detach([*splats.geometry, *values]))
     largest = _largest(
         largest, [v for name, values in blended.items() if name != "depth" for v in values]
     )
     finite = dr.isfinite(probe) & (largest <= FARTHEST)  # pyright: ignore
-    valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
-    extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
-    view = camera.view if isinstance(camera, Views) else None
-    return Splats(shape, blended, dr.detach(z), extent, valid, finite, line, view)
+    return replace(splats, valid=splats.valid & finite, finite=finite)
 
 
 def _largest(bound: Float, values: Sequence[Float]) -> Float:
@@ -256,79 +423,8 @@ def _largest(bound: Float, values: Sequence[Float]) -> Float:
     return bound
 
 
-def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Float, Float]:
-    """Return points in camera space, in single precision."""
-    x, y, z = (
-        mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t))))
-        for a, b, c, t in pose
-    )
-    return x, y, z
-
-
-def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
-    """Return R [3][3] in single, and [R t] [3][4] and the camera's centre -R't [3] in double
-    precision.
-
-    All are Dr.Jit floats, of width 1 for one camera, and attached to the gradient of a Dr.Jit
-    `viewmat`.
-    """
-    if isinstance(camera, Views):
-        rows = [np.ravel(c.viewmat)[:12] for c in camera.cameras]
-        numbers = _row_of(mi.Float64, rows, camera.view)
-    else:
-        viewmat: Tensor = camera.viewmat
-        if dr.is_tensor_v(viewmat):
-            memory = mi.Float64(viewmat.array)
-            numbers = [dr.gather(mi.Float64, memory, mi.UInt32(k)) for k in range(12)]
-        else:
-            numbers = _numbers(mi.Float64, tuple(np.asarray(viewmat, float).flat[:12]))
-    rows = [list(numbers[4 * i : 4 * i + 4]) for i in range(3)]
-    eye = [-sum(row[k] * row[3] for row in rows) for k in range(3)]
-    return [[mi.Float(v) for v in row[:3]] for row in rows], rows, eye
-
-
-def _intrinsics(camera: Camera | Views) -> list[Float]:
-    """Return fx, fy, cx, cy, near, the bounds (low, high) of x/z and of y/z, and delay, readout and
-    height.
-
-    They are read from memory: with Python numbers, every camera would compile its own kernels.
-    """
-    if isinstance(camera, Views):
-        return _row_of(mi.Float, [_numbers_of(c) for c in camera.cameras], camera.view)
-    values = list(_numbers(mi.Float, tuple(_numbers_of(camera))))
-    attached = camera.intrinsics if isinstance(camera, AttachedCamera) else ()
-    return [*map(dr.replace_grad, values, attached), *values[len(attached) :]]
-
-
-@lru_cache(maxsize=1024)  # the views of a rig are projected to again and again
-def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
-    """Return numbers in memory, each an array of width 1."""
-    elements = tuple(_row_of(kind, [values], mi.UInt32(0)))
-    dr.eval(elements)
-    return elements
-
-
-def _row_of(kind: type[Jit], rows: Sequence[Any], index: UInt32) -> list[Jit]:
-    """Return the numbers of one of some rows in each lane."""
-    memory = from_numpy(kind, rows)
-    count = len(rows[0])
-    return [dr.gather(kind, memory, index * count + k) for k in range(count)]
-
-
-def _numbers_of(camera: Camera) -> list[float]:
-    """Return the numbers that `_intrinsics` describes."""
-    (fx, _, cx), (_, fy, cy) = camera.K[:2]
-    # Up to which the projection is linearised: 30 % of the half view on every side.
-    bounds = [
-        bound
-        for f, c, size in ((fx, cx, camera.width), (fy, cy, camera.height))
-        for bound in (-c / f - 0.15 * size / f, (size - c) / f + 0.15 * size / f)
-    ]
-    return [fx, fy, cx, cy, camera.near, *bounds, camera.delay, camera.readout, camera.height]
-
-
-def _rotation(quats: Jit) -> list[Jit]:
-    """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 is the
+def _inverse_rotation(quats: Vector4f) -> Matrix3f:
+    """Return Q', the transposed rotation matrix of wxyz quaternions of any length; length 0 is the
     identity.
     """
     largest = dr.max(dr.abs(dr.detach(quats)))
@@ -337,96 +433,119 @@ def _rotation(quats: Jit) -> list[Jit]:
     # selection would not.
     scaled_quats = quats * dr.select(zero, 0, dr.rcp(dr.minimum(largest, 1e30)))
     w, x, y, z = dr.normalize(scaled_quats + mi.Vector4f(dr.select(zero, 1, 0), 0, 0, 0))
-    return [
-        mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        mi.Vector3f(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    ]
+    x_axis = mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    y_axis = mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    z_axis = mi.Vector3f(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    return mi.Matrix3f(x_axis, y_axis, z_axis)
+
+
+@dataclass(frozen=True)
+class _ScreenAxes:
+    """Axes of a Gaussian on the screen, U = J R Q diag(s), and in depth.
+
+    U is in units of the splat's size on the screen, at least one pixel and of the order of the
+    largest entry of U; w in units of its size in the world.
+    """
+
+    u: Vector3f  #: First row of U.
+    v: Vector3f  #: Second row of U.
+    w: Vector3f  #: Last row of R Q diag(s).
+    r_focal: Float  #: World units per px.
+    r_scale: Float  #: 1 / world units.
 
 
 def _screen_axes(
-    tan_x: Float,
-    tan_y: Float,
-    jx: Float,
-    jy: Float,
-    R: list[list[Float]],
-    quats: Jit,
-    scales: Jit,
-    limits: list[Float],
-) -> tuple[Jit, Jit, Jit, Float, Float]:
-    """Return the rows of U = J R Q diag(s) and w = R_z Q diag(s), three vectors [3], and their
-    units.
-
-    U is in units of the splat's size on the screen, at least one pixel and of the order of the
-    largest entry of U; w in units of its size in the world. The units are returned as world units
-    per px and 1 / world units.
-    """
+    tangent: Vector2f,
+    slope: Vector2f,
+    lens: Intrinsics,
+    R: Matrix3f,
+    quats: Vector4f,
+    scales: Vector3f,
+) -> _ScreenAxes:
+    """Return the axes of Gaussians at x/z and y/z, where the image moves by `slope` px per unit."""
     # Outside the view the linearisation diverges: its point is clamped to 1.3 times the half view,
     # as in 3DGS.
-    lo_x, hi_x, lo_y, hi_y = limits
-    tan_x = dr.clip(tan_x, lo_x, hi_x)
-    tan_y = dr.clip(tan_y, lo_y, hi_y)
-    r_focal = dr.rcp(dr.detach(dr.maximum(jx, jy)))
+    tangent = dr.clip(tangent, lens.low, lens.high)
+    r_focal = dr.rcp(dr.detach(dr.max(slope)))
     r_scale = dr.rcp(dr.maximum(dr.max(dr.detach(scales)), r_focal))
-    jx = jx * r_focal
-    jy = jy * r_focal
+    slope = slope * r_focal
     scales = scales * r_scale
-    J0 = mi.Vector3f(*(jx * (R[0][k] - tan_x * R[2][k]) for k in range(3)))
-    J1 = mi.Vector3f(*(jy * (R[1][k] - tan_y * R[2][k]) for k in range(3)))
-    Q = _rotation(quats)
-    z_axis = mi.Vector3f(*R[2])
-    u0, u1, w = (
-        mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1, z_axis)
-    )
-    return u0, u1, w, r_focal, r_scale
+    right, down, forward = R
+    # The rows of J R.
+    row_x = slope.x * (right - tangent.x * forward)
+    row_y = slope.y * (down - tangent.y * forward)
+    inverse = _inverse_rotation(quats)
+    u = inverse @ row_x * scales
+    v = inverse @ row_y * scales
+    w = inverse @ forward * scales
+    return _ScreenAxes(u, v, w, r_focal, r_scale)
 
 
-def _depth_profile(
-    z: Float,
-    rows: tuple[Jit, Jit, Jit],
-    covariance: tuple[Float, Float, Float],
-    det: Float,
-    eps: Float,
-    r_focal: Float,
-    r_scale: Float,
-) -> tuple[Float, Float, Float, Float]:
-    """Return the depth z + gx dx + gy dy and the inverse standard deviation along rays, as (z, gx,
-    gy, 1 / sigma).
+@dataclass(frozen=True)
+class _ScreenCovariance:
+    """U U' + eps I and its determinant."""
+
+    xx: Float
+    xy: Float
+    yy: Float
+    det: Float
+    det_exact: Float  #: det U U'.
+    eps: Float
+
+
+def _screen_covariance(axes: _ScreenAxes, eps: Float) -> _ScreenCovariance:
+    """Return U U' + eps I."""
+    xx = dr.dot(axes.u, axes.u)
+    yy = dr.dot(axes.v, axes.v)
+    xy = dr.dot(axes.u, axes.v)
+    # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for
+    # needles.
+    det_exact = dr.squared_norm(dr.cross(axes.u, axes.v))
+    det = det_exact + eps * (xx + yy) + eps * eps
+    return _ScreenCovariance(xx + eps, xy, yy + eps, det, det_exact, eps)
+
+
+def _depth_profile(z: Float, axes: _ScreenAxes, covariance: _ScreenCovariance) -> DepthProfile:
+    """Return the depth z + gx dx + gy dy and the inverse standard deviation along rays.
 
     The response along the ray is largest at that depth, in the affine approximation (RaDe-GS, Zhang
     et al. 2024).
     """
-    u0, u1, w = rows
-    xx, xy, yy = covariance
-    zx = dr.dot(u0, w)
-    zy = dr.dot(u1, w)
-    slope = r_focal / det
+    u = axes.u
+    v = axes.v
+    w = axes.w
+    eps = covariance.eps
+    zx = dr.dot(u, w)
+    zy = dr.dot(v, w)
+    slope = axes.r_focal / covariance.det
     # The determinant with the third row and column, as a sum of squares: differences would cancel
     # for thin Gaussians.
-    across = dr.cross(u0, u1)
-    minors = dr.squared_norm(dr.cross(u0, w)) + dr.squared_norm(dr.cross(u1, w))
+    across = dr.cross(u, v)
+    minors = dr.squared_norm(dr.cross(u, w)) + dr.squared_norm(dr.cross(v, w))
     det3 = dr.square(dr.dot(across, w)) + eps * minors + eps * eps * dr.squared_norm(w)
-    r_sigma = r_scale * dr.rsqrt(dr.maximum(det3 / det, _THINNEST**2))
-    return z, slope * (yy * zx - xy * zy), slope * (xx * zy - xy * zx), r_sigma
+    r_sigma = axes.r_scale * dr.rsqrt(dr.maximum(det3 / covariance.det, _THINNEST**2))
+    xy = covariance.xy
+    gradient = mi.Vector2f(covariance.yy * zx - xy * zy, covariance.xx * zy - xy * zx)
+    return DepthProfile(z, slope * gradient, r_sigma)
 
 
-def _colors(direction: Jit, coeffs: list[Float]) -> tuple[Float, ...]:
-    """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention) of 3 K
-    coefficients.
-    """
+def _colors(direction: Vector3f, coeffs: Sequence[Float]) -> Color3f:
+    """Return max(0.5 + SH(direction), 0) (3DGS's convention) of 3 K coefficients."""
     basis = dr.sh_eval(dr.normalize(direction), int(sqrt(len(coeffs) // 3)) - 1)
-    sums: list[Float] = [sum(B * coeffs[3 * k + c] for k, B in enumerate(basis)) for c in range(3)]
-    return tuple(dr.maximum(total + 0.5, 0) for total in sums)
+    color = mi.Color3f(0)
+    for k, value in enumerate(basis):
+        color += value * mi.Color3f(coeffs[3 * k : 3 * k + 3])
+    return dr.maximum(color + 0.5, 0)
 
 
 def _screen_motion(
-    motion: list[Float],
-    point: tuple[Float, Float, Float],
-    focal: tuple[Float, Float],
-    near: Float,
-    R: list[list[Float]],
+    motion: Vector3f,
+    tangent: Vector2f,
+    z: Float,
+    lens: Intrinsics,
+    R: Matrix3f,
     first_order: bool,
-) -> tuple[Float, Float]:
+) -> Vector2f:
     """Return the displacement pi(x) - pi(x - v) in px, where v = R motion: fx (vx - x/z vz) / (z -
     vz), likewise for y.
 
@@ -435,15 +554,15 @@ def _screen_motion(
 
     Args:
         motion: displacement in the world since the last frame.
-        point: x/z, y/z and z in camera space.
-        focal: fx and fy, px.
-        near: near plane, world units.
+        tangent: x/z and y/z in camera space.
+        z: depth, world units.
+        lens: intrinsics of the camera.
         R: rotation of the camera.
         first_order: whether J v is requested.
     """
-    vx, vy, vz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
-    tan_x, tan_y, z = point
-    earlier = z - vz
-    depth = z if first_order else dr.select(earlier >= near, earlier, z)
-    fx, fy = focal
-    return fx * (vx - tan_x * vz) / depth, fy * (vy - tan_y * vz) / depth
+    x_axis, y_axis, z_axis = R.T
+    v = x_axis * motion.x + y_axis * motion.y + z_axis * motion.z
+    earlier = z - v.z
+    # A quotient of vectors: that of a vector and a number is a product with its rounded inverse.
+    depth = mi.Vector2f(z if first_order else dr.select(earlier >= lens.near, earlier, z))
+    return lens.focal * (v.xy - tangent * v.z) / depth

@@ -1,8 +1,8 @@
-"""`rasterize`, the public call of the renderer."""
+"""`rasterize` and `render_view`, the public calls of the renderer."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from math import prod
 from typing import Any
@@ -11,21 +11,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import float_tensor, refuse_freezing
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import OF_SENSOR, Camera
-from morgs_mi.core.checks import check_type, kind_of, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
-from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
-from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Bool, Float, Jit, Tensor, Tensors
-from morgs_mi.render.backend import block_shape, elements
-from morgs_mi.render.blocks import build_lists, touches
+from morgs_mi.platform.checks import check_type, kind_of, numbers, require
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.memory import check_memory
+from morgs_mi.platform.png import png_bytes
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.backend import block_shape
+from morgs_mi.render.background import backdrops, over
+from morgs_mi.render.blocks import BlockLists, build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
 from morgs_mi.render.compositing import Layout, blend
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import FARTHEST, Splats, project
-from morgs_mi.render.region import Region, full_view
+from morgs_mi.render.region import DrawnBlocks, full_view
 from morgs_mi.render.render_config import RenderConfig
 
 # Beside the channels color, depth, motion and confidence, a record then takes seven packets of 4
@@ -94,19 +98,15 @@ def rasterize(
     camera: Camera | Sequence[Camera],
     channels: Sequence[str] = ("color", "alpha"),
     background: Sequence[float] | Jit | None = None,
-    detach_weights: Sequence[str] = (),
-    region: Region | None = None,
     features: Tensor | np.ndarray | None = None,
-    static_splats: Splats | None = None,
     config: RenderConfig | None = None,
-    depth_limit: Tensor | np.ndarray | None = None,
-    means2d: Tensor | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
 
     `dr.backward` and `dr.forward` give the derivatives with respect to every attribute of
     `gaussians`, and to the pose if `camera.viewmat` is a Dr.Jit tensor. Channels that are not
-    requested are neither traced nor computed.
+    requested are neither traced nor computed. `render_view` draws a part of a view, or splats that
+    surfaces hide.
 
     Args:
         gaussians: N Gaussians, usually a `Gaussians`, or any object with its activated attributes.
@@ -118,38 +118,21 @@ def rasterize(
         background: display-referred colour [3] behind all Gaussians, or an image of them in the
             shape of the result's; None: the image of the camera, or the colour of `config`. A
             Dr.Jit array gets gradients.
-        detach_weights: channels with a gradient that reaches only the blended values, not opacity
-            and geometry.
-        region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its
-            blocks are only projected.
         features: [N, F], further values to blend like a colour, returned as `Image.features`; F is
             at most 12.
-        static_splats: further splats of this view that are drawn and get no gradients; they must
-            have the channels.
         config: cut-offs and block shape.
-        depth_limit: [H, W], the camera-space z of every pixel at which an opaque surface ends its
-            ray, world units; inf where there is none. A Gaussian around that depth is drawn in
-            part: by the fraction of its optical depth that the ray has passed. The limit gets no
-            gradient. None: no limit, and no cost.
-        means2d: zeros [N, 4] with gradients enabled. `dr.backward` gives them the gradient with
-            respect to the projected mean in pixels (two columns), and the sums of its absolute
-            values over the pixels (two columns), by which density control may choose parents. Only
-            for one whole view without `static_splats` and `depth_limit`. None: no cost.
 
     Example:
         >>> image = morgs_mi.rasterize(gaussians, camera, channels=("color", "depth"))
         >>> dr.backward(dr.mean(dr.square(image.color - target), axis=None))
 
     Returns:
-        An `Image` with one tensor per requested channel. On a region, the drawn pixels and their
-        gradients equal the full computation's.
+        An `Image` with one tensor per requested channel.
 
     Raises:
-        ValueError: an image that does not fit in memory, cameras of different sizes, or several
-            with a region, static splats or a depth limit, an unknown channel, a channel with a
-            missing attribute, NaN or infinite attributes or poses, values above 1e18 to blend, a
-            region of another view or block shape, `static_splats` together with a depth limit, a
-            depth limit with gradients enabled, or a call inside a function under `dr.freeze`.
+        ValueError: an image that does not fit in memory, cameras of different sizes, an unknown
+            channel, a channel with a missing attribute, NaN or infinite attributes or poses, values
+            above 1e18 to blend, or a call inside a function under `dr.freeze`.
 
     Equal depths are blended in the order of the input. A quaternion of length 0 is the identity.
     Gaussians nearer than the camera's near plane or beyond 1e18 units, and those that overflow
@@ -160,100 +143,195 @@ def rasterize(
     another one computes derivatives, hold `render_lock` around `dr.backward` and `dr.forward`:
     Dr.Jit 1.5 can deadlock otherwise.
     """
-    refuse_freezing("rasterize()")
-    config = RenderConfig() if config is None else config
+    place = "rasterize()"
+    refuse_freezing(place)
+    config = config_or_default(place, config, RenderConfig())
+    _check_scene(place, gaussians, channels)
     is_stack = isinstance(camera, Sequence)
     cameras = tuple(camera) if is_stack else (camera,)
-    options = {
-        "background": background,
-        "features": features,
-        "config": config,
-        "region": region,
-        "static_splats": static_splats,
-        "depth_limit": depth_limit,
-        "means2d": means2d,
-    }
-    for problem in _problems(gaussians, cameras, channels, detach_weights, options, is_stack):
-        raise ValueError(f"rasterize(): {problem}.")
-    channels = tuple(dict.fromkeys(channels))
-    sizes = {**channel_sizes(), "alpha": 1}
-    view = cameras[0]
-    if features is not None:
-        table = float_tensor("rasterize()", "features", features)
-        features = table
-        sizes["features"] = int(table.shape[1])
-        channels = (*channels, "features")
-    limits = None
-    if depth_limit is not None:  # finite: a limit at infinity is one beyond all Gaussians
-        depths = float_tensor("rasterize()", "depth_limit", depth_limit)
-        limits = dr.clip(depths.array, -FARTHEST, FARTHEST)
-    if region is None:
-        region = full_view(view.width, view.height, block_shape(config), len(cameras), mi.variant())
+    _check_cameras(place, cameras)
+    size = (cameras[0].height, cameras[0].width)
+    shape = (len(cameras), *size) if is_stack else size
     if background is None:
-        background = config.background
-        if (images := backdrops(cameras, config)) is not None:
-            background = np.stack(images) if is_stack else images[0]
-            background = background if region.whole else region.crop(images[0])
-    stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
-    blended = tuple(c for c in channels if c != "alpha")
-    cut = limits is not None
-    projected = (*blended, "profile") if cut else blended
-    rows = None
+        images = backdrops(cameras, config)
+        background = config.background if images is None else np.stack(images)
+    else:
+        _check_background(place, background, (*shape, 3))
+    table = _feature_table(place, features, gaussians)
+    output = Output(_all_channels(channels, table), (), config, shape)
+    region = full_view(*cameras[0].size, block_shape(config), len(cameras), mi.variant())
     if not int(gaussians.means.shape[0]):
-        rows = mi.UInt32()
-    elif not region.whole and static_splats is None:  # those that touch no block are not blended
+        return _nothing(output, table, region, background)
+    parts = [project(gaussians, part, output.blended, config, None, table) for part in cameras]
+    splats = parts[0] if len(parts) == 1 else _stacked(parts)
+    dr.schedule(splats)
+    _check_finite(splats.finite, gaussians, cameras, table)
+    return draw(output, splats, splats, region, background)[0]
+
+
+@with_render_lock
+def render_view(
+    gaussians: ActivatedGaussians,
+    view: ActiveView,
+    channels: Sequence[str] = ("color",),
+    background: Sequence[float] | Jit | None = None,
+    features: Tensor | np.ndarray | None = None,
+    detach_weights: Sequence[str] = (),
+    depth_limit: Tensor | np.ndarray | None = None,
+    means2d: Tensor | None = None,
+) -> Image:
+    """Render Gaussians in an active view, differentiably, as `rasterize` does.
+
+    Args:
+        gaussians: N Gaussians. Those that touch none of the view's blocks are only projected.
+        view: camera and settings, the blocks that are drawn, and static splats beside the
+            Gaussians, which must have the channels and have features of 0.
+        channels: as for `rasterize`.
+        background: as for `rasterize`, an image of the drawn pixels; None: the view's.
+        features: as for `rasterize`.
+        detach_weights: channels with a gradient that reaches only the blended values, not opacity
+            and geometry.
+        depth_limit: [H, W], the camera-space z of every pixel at which an opaque surface ends its
+            ray, world units; inf where there is none. A Gaussian around that depth is drawn in
+            part: by the fraction of its optical depth that the ray has passed. The limit gets no
+            gradient. None: no limit, and no cost.
+        means2d: zeros [N, 4] with gradients enabled. `dr.backward` gives them the gradient with
+            respect to the projected mean in pixels (two columns), and the sums of its absolute
+            values over the pixels (two columns), by which density control may choose parents. Only
+            for a whole view without static splats and `depth_limit`. None: no cost.
+
+    Example:
+        >>> view = morgs_mi.ActiveView(camera)
+        >>> probe = dr.zeros(mi.TensorXf, (len(gaussians), 4))
+        >>> dr.enable_grad(probe)
+        >>> image = morgs_mi.render_view(gaussians, view, means2d=probe)
+
+    Returns:
+        An `Image` with one tensor per requested channel. On a region, the drawn pixels and their
+        gradients equal the full computation's.
+
+    Raises:
+        ValueError: as for `rasterize`; or static splats together with a depth limit, a depth limit
+            with gradients enabled, or `means2d` with a region, static splats or a depth limit.
+    """
+    place = "render_view()"
+    refuse_freezing(place)
+    check_type(place, "view", view, ActiveView, "pass morgs_mi.ActiveView(camera)")
+    _check_scene(place, gaussians, channels, detach_weights)
+    camera = view.camera
+    _check_cameras(place, (camera,))
+    region = view.region or full_view(*camera.size, view.grid.block, 1, mi.variant())
+    if background is None:
+        background = view.background
+    else:
+        _check_background(place, background, region.shape(3))
+    table = _feature_table(place, features, gaussians)
+    shape = region.shape(0)[:-1]
+    output = Output(_all_channels(channels, table), tuple(detach_weights), view.config, shape)
+    projected = output.blended
+    limits = None
+    if depth_limit is not None:
+        limits = _depth_limits(place, depth_limit, view)
+        projected = (*projected, "profile")
+    if means2d is not None:
+        _check_means2d(place, means2d, gaussians, view, depth_limit)
+    if not int(gaussians.means.shape[0]):
+        return _nothing(output, table, region, background)
+    rows = None
+    if not region.whole and view.static_splats is None:
+        # Those that touch no block are not blended.
         with dr.suspend_grad():
-            bare = project(dr.detach(gaussians), view, (), config)
+            bare = project(dr.detach(gaussians), camera, (), view.config)
             visible = touches(bare, region)
             dr.schedule(visible)
-            _check_finite(bare.finite, gaussians, cameras, features)
+            _check_finite(bare.finite, gaussians, [camera], table)
             rows = dr.compress(visible)
-    if rows is not None and not dr.width(rows):
-        images = {name: dr.zeros(mi.TensorXf, (*stack, sizes[name])) for name in channels}
-        if background is not None and "color" in images:
-            zeros = dr.zeros(mi.Float, prod((*stack, 3)))
-            images["color"] = _tensor(over(background, zeros, zeros), region, (*stack, 3))
-        return _image(images)
-    parts = [project(gaussians, part, projected, config, rows, features) for part in cameras]
-    splats = parts[0] if len(parts) == 1 else _stacked(parts)
-    if static_splats is not None:
-        splats = splats.concatenated_with(static_splats)
+        if not dr.width(rows):
+            return _nothing(output, table, region, background)
+    splats = project(gaussians, camera, projected, view.config, rows, table)
     absolute: Sequence[Float] = ()
     if means2d is not None:
         lane = dr.arange(mi.UInt32, len(splats)) * 4
         x, y, *absolute = (dr.gather(mi.Float, means2d.array, lane + k) for k in range(4))
-        mean_x, mean_y, *others = splats.shape
-        splats = replace(splats, shape=(mean_x + x, mean_y + y, *others))
-    dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
-    _check_finite(splats.finite, gaussians, cameras, features)
-    values = [splats.channels[name] for name in blended]
+        splats = replace(splats, mean=splats.mean + mi.Point2f(x, y))
+    dr.schedule(splats)
+    _check_finite(splats.finite, gaussians, [camera], table)
+    static = view.static_splats
+    drawn = splats
+    if static is not None:  # these get no gradients
+        with dr.suspend_grad():
+            drawn = splats.concatenated_with(static.alone)
+    return draw(output, splats, drawn, region, background, limits, tuple(absolute))[0]
+
+
+@dataclass(frozen=True)
+class Output:
+    """Image that splats are drawn to."""
+
+    channels: tuple[str, ...]  #: The requested channels.
+    detach_weights: tuple[str, ...]  #: Those with a gradient that reaches only the blended values.
+    config: RenderConfig  #: Cut-offs and block shape.
+    shape: tuple[int, ...]  #: Of its tensors, without the axis of the channel.
+
+    @property
+    def blended(self) -> tuple[str, ...]:
+        """The channels that are blended: all but alpha."""
+        return tuple(name for name in self.channels if name != "alpha")
+
+
+def draw(
+    output: Output,
+    splats: Splats,
+    drawn: Splats,
+    region: DrawnBlocks,
+    background: Sequence[float] | Jit | None = None,
+    limits: Float | None = None,
+    absolute: tuple[Float, ...] = (),
+) -> tuple[Image, BlockLists]:
+    """Return the image of splats on a region, and their lists.
+
+    Args:
+        output: description of the image.
+        splats: the splats that get gradients.
+        drawn: these, and perhaps static ones after them.
+        region: the blocks to draw.
+        background: as for `rasterize`.
+        limits: flat depth limits of the pixels of the view.
+        absolute: as for `blend`.
+    """
+    blended = output.blended
     with dr.suspend_grad():
-        lists = build_lists(
-            splats, [column for columns in values for column in columns], region, config, limits
-        )
+        columns = [column for name in blended for column in drawn.channels[name]]
+        lists = build_lists(drawn, columns, region, output.config, limits)
+    sizes = {**{name: len(splats.channels[name]) for name in blended}, "alpha": 1}
     # Divided by the sum of the weights, or composited by it over the background.
     weighted = [*NORMALISED, *(["color"] if background is not None else [])]
-    read_alpha = [name for name in channels if name in ("alpha", *weighted)]
+    read_alpha = [name for name in output.channels if name in ("alpha", *weighted)]
     layout = Layout(
-        tuple(Channel(sizes[name], name not in detach_weights) for name in blended),
+        tuple(Channel(sizes[name], name not in output.detach_weights) for name in blended),
         bool(read_alpha),
-        any(name not in detach_weights for name in read_alpha),
-        config,
-        cut,
-        means2d is not None,
+        any(name not in output.detach_weights for name in read_alpha),
+        output.config,
+        limits is not None,
+        bool(absolute),
     )
-    outputs = blend(splats.geometry, values, region, lists, layout, tuple(absolute))
-    images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
+    values = [splats.channels[name] for name in blended]
+    images = blend(splats.geometry, values, region, lists, layout, absolute)
+    images = dict(zip((*blended, "alpha", "coverage"), images, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
         if name in weighted:
-            weight = dr.detach(coverage) if name in detach_weights else coverage
+            weight = dr.detach(coverage) if name in output.detach_weights else coverage
             weight = repeat_each(weight, sizes[name])
             if name in NORMALISED:  # 0 where nothing is drawn
                 images[name] = dr.select(weight > 0, images[name] / dr.maximum(weight, 1e-8), 0)
             else:
                 images[name] = over(background, images[name], weight)
-    return _image({name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels})
+    tensors = {
+        name: _tensor(images[name], region, (*output.shape, sizes[name]))
+        for name in output.channels
+    }
+    return _image(tensors), lists
 
 
 def _image(tensors: Tensors) -> Image:
@@ -261,37 +339,6 @@ def _image(tensors: Tensors) -> Image:
     others = dict(tensors)
     channels = {f.name: others.pop(f.name) for f in fields(Image) if f.name in others}
     return Image(**channels, others=others)
-
-
-def backdrops(cameras: Sequence[Camera], config: RenderConfig) -> list[np.ndarray] | None:
-    """Return the image behind all Gaussians for each camera [H, W, 3]; None if no camera has one:
-    it is the colour of `config`.
-    """
-    images = [camera.backdrop for camera in cameras]
-    if all(image is None for image in images):
-        return None
-    plain = np.zeros((cameras[0].height, cameras[0].width, 3), np.float32)
-    plain += config.background or (0, 0, 0)
-    return [plain if image is None else image for image in images]
-
-
-def over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:
-    """Return flat colours with the sums of their weights, composited over the background."""
-    color: Any = background
-    if dr.is_array_v(color):
-        behind = color.array if dr.is_tensor_v(color) else dr.ravel(color)
-    else:
-        behind = from_numpy(mi.Float, np.asarray(color, np.float32).ravel())
-    if dr.width(behind) == dr.width(values):
-        return dr.fma(1 - weight, behind, values)
-    # Numbers of their own: the gradient of one array would be added by all pixels to three places.
-    red, green, blue = (elements(behind, mi.UInt32(k)) for k in range(3))
-    component = dr.arange(mi.UInt32, dr.width(weight)) % 3
-    return dr.fma(
-        1 - weight,
-        dr.select(component == 0, red, dr.select(component == 1, green, blue)),
-        values,
-    )
 
 
 def _stacked(parts: list[Splats]) -> Splats:
@@ -305,159 +352,213 @@ def _stacked(parts: list[Splats]) -> Splats:
     return parts[0]
 
 
-def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:
+def _tensor(values: Float, region: DrawnBlocks, shape: tuple[int, ...]) -> Tensor:
     """Return a channel's image; pixels of a region that lie outside the view are 0."""
     if region.weights is not None:
         values = values * repeat_each(region.weights, shape[-1])
     return mi.TensorXf(values, shape)
 
 
-def _problems(
-    gaussians: ActivatedGaussians,
-    cameras: Sequence[Camera],
-    channels: Sequence[str],
-    detach_weights: Sequence[str],
-    options: Mapping[str, Any],
-    is_stack: bool,
-) -> Iterator[str]:
-    """Yield a sentence for each argument of `rasterize` that is refused; a later one relies on the
-    earlier ones.
+def _nothing(
+    output: Output, features: Tensor | None, region: DrawnBlocks, background: Any
+) -> Image:
+    """Return the image where no Gaussian is drawn."""
+    sizes = {**channel_sizes(), "alpha": 1}
+    if features is not None:
+        sizes["features"] = int(features.shape[1])
+    images = {name: dr.zeros(mi.TensorXf, (*output.shape, sizes[name])) for name in output.channels}
+    if background is not None and "color" in images:
+        shape = (*output.shape, 3)
+        zeros = dr.zeros(mi.Float, prod(shape))
+        images["color"] = _tensor(over(background, zeros, zeros), region, shape)
+    return _image(images)
 
-    Args:
-        gaussians: as for `rasterize`, like `channels` and `detach_weights`.
-        cameras: the view, or all of them.
-        channels: to render.
-        detach_weights: channels.
-        options: the other arguments, by name.
-        is_stack: whether a sequence of cameras was given.
-    """
-    if not hasattr(gaussians, "means"):
-        yield f"`gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some"
+
+def _all_channels(channels: Sequence[str], features: Tensor | None) -> tuple[str, ...]:
+    """Return the channels of an image, with that of the features if there are any."""
+    return (*dict.fromkeys(channels), *(() if features is None else ("features",)))
+
+
+# ---- checks of the arguments
+
+
+def _check_scene(
+    place: str,
+    gaussians: ActivatedGaussians,
+    channels: Sequence[str],
+    detach_weights: Sequence[str] = (),
+) -> None:
+    """Raise an error unless Gaussians have channels, and the variant can differentiate them."""
+    kind = f"a {type(gaussians).__name__}"
+    require(hasattr(gaussians, "means"), place, "`gaussians` must be Gaussians", kind, "pass some")
     for name, names in (("channels", channels), ("detach_weights", detach_weights)):
-        if isinstance(names, str) or not isinstance(names, Sequence):
-            yield f"`{name}` must be a sequence of names, got {names!r}; pass a tuple"
-    if mi.variant() is None or not dr.is_jit_v(mi.Float) or not dr.is_diff_v(mi.Float):
-        yield (
-            "expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got "
-            f"{mi.variant()!r}; call mi.set_variant() first"
+        require(
+            isinstance(names, Sequence) and not isinstance(names, str),
+            place,
+            f"`{name}` must be a sequence of names",
+            repr(names),
+            "pass a tuple",
         )
+    require(
+        mi.variant() and dr.is_jit_v(mi.Float) and dr.is_diff_v(mi.Float),
+        place,
+        "expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb'",
+        repr(mi.variant()),
+        "call mi.set_variant() first",
+    )
     motion = BY_ACTIVATED_NAME["motion"]
     required = {"motion": motion, "guided_motion": motion, **attribute_channels()}
     choices = ("color", "alpha", "depth", *required)
     for name in (*channels, *detach_weights):
-        if name not in choices and (name != "features" or name in channels):
-            yield (
-                f"`channels` must be out of {', '.join(choices)}, got {name!r}; use one of these, "
-                "or pass other values as `features`"
-            )
+        require(
+            name in choices or (name == "features" and name not in channels),
+            place,
+            f"`channels` must be out of {', '.join(choices)}",
+            repr(name),
+            "use one of these, or pass other values as `features`",
+        )
     for name, attribute in required.items():
-        if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
-            yield (
-                f"channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or "
-                "remove the channel"
-            )
+        require(
+            name not in channels or getattr(gaussians, attribute.activated_name, None) is not None,
+            place,
+            f"channel {name!r} requires Gaussians with `{attribute.name}`",
+            "none",
+            "set it or remove the channel",
+        )
 
-    if not cameras:
-        yield "`camera` must be one or more cameras, got an empty sequence; pass one"
+
+def _check_cameras(place: str, cameras: Sequence[Camera]) -> None:
+    """Raise an error unless there are cameras of one size, and memory for their images."""
+    require(cameras, place, "`camera` must be one or more cameras", "an empty sequence", "pass one")
     for camera in cameras:
-        check_type("rasterize()", "camera", camera, Camera, OF_SENSOR)
-    view = cameras[0]
-    V = len(cameras)
+        check_type(place, "camera", camera, Camera, OF_SENSOR)
     sizes = [*dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)]
-    if len(sizes) > 1:
-        yield (
-            f"`camera` must be cameras of the same size, got {' and '.join(sizes)}; render one "
-            "camera at a time"
-        )
-    pixels = V * view.width * view.height
-    if pixels > 2**28:
-        yield (
-            f"the image must have at most 2^28 pixels, got {V} times {sizes[0]}; render it in "
-            "tiles, one camera each"
-        )
+    require(
+        len(sizes) == 1,
+        place,
+        "`camera` must be cameras of the same size",
+        " and ".join(sizes),
+        "render one camera at a time",
+    )
+    V = len(cameras)
+    pixels = V * prod(cameras[0].size)
+    require(
+        pixels <= 2**28,
+        place,
+        "the image must have at most 2^28 pixels",
+        f"{V} times {sizes[0]}",
+        "render it in tiles, one camera each",
+    )
     if pixels >= _LARGE:
-        check_memory(
-            "rasterize()",
-            _PIXEL_BYTES * pixels,
-            f"{V} x {sizes[0]} pixels",
-            "render a smaller image, or tiles, one camera each",
+        content = f"{V} x {sizes[0]} pixels"
+        remedy = "render a smaller image, or tiles, one camera each"
+        check_memory(place, _PIXEL_BYTES * pixels, content, remedy)
+
+
+def _feature_table(
+    place: str, features: Tensor | np.ndarray | None, gaussians: ActivatedGaussians
+) -> Tensor | None:
+    """Return features [N, F] as a tensor."""
+    if features is None:
+        return None
+    table: Tensor = float_tensor(place, "features", features)
+    shape = tuple(table.shape)
+    N = int(gaussians.means.shape[0])
+    require(
+        len(shape) == 2 and shape[0] == N and 1 <= shape[1] <= _MOST_FEATURES,
+        place,
+        f"`features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}",
+        list(shape),
+        "blend more in several calls",
+    )
+    return table
+
+
+def _depth_limits(place: str, depth_limit: Tensor | np.ndarray, view: ActiveView) -> Float:
+    """Return the depth limits of a view's pixels, flat and finite: a limit at infinity is one
+    beyond all Gaussians.
+    """
+    depths: Tensor = float_tensor(place, "depth_limit", depth_limit)
+    shape = (view.camera.height, view.camera.width)
+    is_image = tuple(depths.shape) == shape
+    require(
+        is_image and not dr.any(dr.isnan(depths.array)),
+        place,
+        f"`depth_limit` must be one depth per pixel, {list(shape)}",
+        "NaN" if is_image else list(depths.shape),
+        "use inf where there is no surface",
+    )
+    require(
+        view.static_splats is None,
+        place,
+        "`depth_limit` must be None where `static_splats` are given",
+        "both",
+        "their depth along a ray is not stored",
+    )
+    require(
+        not dr.grad_enabled(depths),
+        place,
+        "`depth_limit` must not be attached to a gradient graph, because it gets no gradient",
+        "one with gradients enabled",
+        "pass dr.detach(depth_limit)",
+    )
+    return dr.clip(depths.array, -FARTHEST, FARTHEST)
+
+
+def _check_background(place: str, background: Any, shape: tuple[int, ...]) -> None:
+    """Raise an error unless a background is a colour, or an image of a shape."""
+    if dr.is_tensor_v(background) and tuple(background.shape) == shape:
+        return  # the pixels of a tensor are not read
+    values = np.squeeze(background) if dr.is_array_v(background) else background
+    require(
+        np.shape(values) in ((3,), shape)
+        and (np.abs(numbers(place, "background", values)) <= FARTHEST).all(),
+        place,
+        f"`background` must be three finite numbers of at most 1e18, or an image {list(shape)}",
+        kind_of(values) if np.ndim(values) > 1 else repr(values),
+        "pass a colour, an image or None",
+    )
+
+
+def _check_means2d(
+    place: str, means2d: Tensor, gaussians: ActivatedGaussians, view: ActiveView, depth_limit: Any
+) -> None:
+    """Raise an error unless the means of a view can be probed."""
+    N = int(gaussians.means.shape[0])
+    require(
+        dr.is_tensor_v(means2d) and tuple(means2d.shape) == (N, 4),
+        place,
+        f"`means2d` must be a tensor of zeros [{N}, 4]",
+        f"a {type(means2d).__name__} {list(np.shape(means2d))}",
+        f"use dr.zeros(mi.TensorXf, ({N}, 4))",
+    )
+    others = {
+        "region": view.region,
+        "static_splats": view.static_splats,
+        "depth_limit": depth_limit,
+    }
+    for name, value in others.items():
+        require(
+            value is None,
+            place,
+            f"`{name}` must be None with `means2d`",
+            "one",
+            "render the whole view of one camera",
         )
 
-    background, features, config, region, static_splats, depth_limit, means2d = options.values()
-    check_type("rasterize()", "config", config, RenderConfig)
-    for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
-        if value is not None:
-            check_type("rasterize()", name, value, kind)
-    for name in ("region", "static_splats", "depth_limit", "means2d"):
-        value = options[name]
-        if is_stack and value is not None:
-            yield (
-                f"`{name}` must be None with a sequence of cameras, got a {type(value).__name__}; "
-                "render one camera at a time"
-            )
-    if features is not None:
-        shape = tuple(float_tensor("rasterize()", "features", features).shape)
-        N = int(gaussians.means.shape[0])
-        if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
-            yield (
-                f"`features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, got "
-                f"{list(shape)}; blend more in several calls"
-            )
-    if depth_limit is not None:
-        limits: Tensor = float_tensor("rasterize()", "depth_limit", depth_limit)
-        expected = (view.height, view.width)
-        if tuple(limits.shape) != expected or dr.any(dr.isnan(limits.array)):
-            problem = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
-            yield (
-                f"`depth_limit` must be one depth per pixel, {list(expected)}, got {problem}; use "
-                "inf where there is no surface"
-            )
-        if static_splats is not None:
-            yield (
-                "`depth_limit` must be None where `static_splats` are given, got both; their depth "
-                "along a ray is not stored"
-            )
-        if dr.grad_enabled(limits):
-            yield (
-                "`depth_limit` must not be attached to a gradient graph, because it gets no "
-                "gradient, got one with gradients enabled; pass dr.detach(depth_limit)"
-            )
-    if region is not None:
-        block = block_shape(config)
-        shape = (region.width, region.height, *region.block)
-        if shape != (view.width, view.height, *block):
-            yield (
-                f"`region` must be of a {view.width}x{view.height} view with {block[0]}x{block[1]} "
-                f"blocks like the camera's and the config's, got {shape[0]}x{shape[1]} with "
-                f"{shape[2]}x{shape[3]}; build it for this camera with this config"
-            )
-    if background is not None:
-        shape = (*[V] * is_stack, *(region.shape(3) if region else (view.height, view.width, 3)))
-        is_image = dr.is_tensor_v(background) and tuple(background.shape) == shape
-        values = background if is_image or not dr.is_array_v(background) else np.squeeze(background)
-        # The pixels of a tensor are not read.
-        if not is_image and not (
-            np.shape(values) in ((3,), shape)
-            and (np.abs(numbers("rasterize()", "background", values)) <= FARTHEST).all()
-        ):
-            value = kind_of(values) if np.ndim(values) > 1 else repr(values)
-            yield (
-                "`background` must be three finite numbers of at most 1e18, or an image "
-                f"{list(shape)}, got {value}; pass a colour, an image or None"
-            )
-    if means2d is not None:
-        N = int(gaussians.means.shape[0])
-        if not dr.is_tensor_v(means2d) or tuple(means2d.shape) != (N, 4):
-            yield (
-                f"`means2d` must be a tensor of zeros [{N}, 4], got a {type(means2d).__name__} "
-                f"{list(np.shape(means2d))}; use dr.zeros(mi.TensorXf, ({N}, 4))"
-            )
-        for name in ("region", "static_splats", "depth_limit"):
-            if options[name] is not None:
-                yield (
-                    f"`{name}` must be None with `means2d`, got one; render the whole view of one "
-                    "camera"
-                )
+
+def check_rendering(
+    gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, ...], config: RenderConfig
+) -> None:
+    """Raise the error of `rasterize` about Gaussians that are not finite, for those that were drawn
+    without it.
+
+    Raises:
+        ValueError: an attribute is not finite, or too large to be blended.
+    """
+    with dr.suspend_grad():
+        finite = project(gaussians, camera, channels, config).finite
+        _check_finite(finite, gaussians, [camera], None)
 
 
 def _check_finite(
@@ -469,7 +570,8 @@ def _check_finite(
     Values that are blended must also be at most 1e18, beyond which their squares and gradients
     overflow.
     """
-    if dr.all(finite):
+    count: Any = dr.count(~finite)  # in fewer launches than `dr.all`
+    if not count[0]:
         return
     others = [attribute.activated_name for attribute in attribute_channels().values()]
     blended_names = ("sh_coeffs", "motion", *others)

@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Float, UInt32
-from morgs_mi.render.backend import block_shape, elements
+from morgs_mi.core.arrays import from_numpy, opaque
+from morgs_mi.core.types import Float, Jit, Point2u, UInt32
+from morgs_mi.render.backend import block_shape, elements, sections
 from morgs_mi.render.render_config import RenderConfig
 
 # Blocks of a tile, across and down: one for each bit of a word.
@@ -36,6 +36,11 @@ class BlockGrid:
     width: int  #: Width of the view in pixels.
     height: int  #: Height of the view in pixels.
     block: tuple[int, int]  #: (width, height) of a block in pixels.
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the view in pixels."""
+        return self.width, self.height
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -58,10 +63,72 @@ class BlockGrid:
         return np.rint(shares * (width * height)).astype(np.int32)
 
 
-class Region:
-    """Some blocks of a view, or of several views.
+class DrawnBlocks:
+    """Blocks of pixels that are drawn, as arrays: a `Region`, or a `PaddedRegion` of fixed sizes.
 
-    Images on a region are [A, block_height, block_width, C], block by block, A blocks in all.
+    Images on them are [A, block_height, block_width, C], block by block, A blocks in all, or
+    [H, W, C] if they are a `whole` view.
+    """
+
+    # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in
+    # memory, its rows.
+    tile: UInt32
+    bit: UInt32
+    x: UInt32
+    y: UInt32
+    place: UInt32
+    rows: UInt32
+    pitch: UInt32  # packets from a row of a block to the next, [1]
+    slot_of: UInt32  # slot of every tile of the view, or NO_SLOT
+    tile_table: UInt32  # summed areas of the tiles that have a drawn block
+    # Per slot: first pixel of the tile.
+    corner_x: Float
+    corner_y: Float
+    weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
+    width: int  # of the view, px
+    height: int  # of the view, px
+    block: tuple[int, int]  # width and height of a block, px
+    across: int  # tiles of a row of the view
+    down: int  # tiles of a column of the view
+    whole: bool
+    row: int  # pixels of a row in memory
+    num_blocks: int
+    num_tiles: int
+    num_pixels: int
+    #: Entries of the lists, see `PaddedRegion`; None: as many as needed, which stops the queue.
+    capacity: int | None = None
+
+    def shape(self, channels: int) -> tuple[int, ...]:
+        """Return the shape of an image with `channels` floats per pixel on these blocks."""
+        if self.whole:
+            return self.height, self.width, channels
+        return self.num_blocks, self.block[1], self.block[0], channels
+
+    @property
+    def section_sizes(self) -> tuple[UInt32, UInt32]:
+        """Number of blocks, and of those in each section of a launch (see `backend.sections`)."""
+        *_, lanes = sections(self.num_blocks)
+        return opaque(mi.UInt32, self.num_blocks), opaque(mi.UInt32, lanes)
+
+    @property
+    def size(self) -> Point2u:
+        """Width and height of the view in pixels."""
+        return mi.Point2u(opaque(mi.UInt32, self.width), opaque(mi.UInt32, self.height))
+
+    def pixels(self, lane: UInt32) -> Point2u:
+        """Return the pixels of the view at some places of an image."""
+        if self.whole:
+            y, x = quotient_and_rest(lane, self.row)
+            return mi.Point2u(x, y)
+        width, height = self.block
+        index = lane // (width * height)
+        within = lane - index * (width * height)
+        first = mi.Point2u(elements(self.x, index), elements(self.y, index))
+        return first + mi.Point2u(within % width, within // width)
+
+
+class Region(DrawnBlocks):
+    """Some blocks of a view, or of several views.
 
     Args:
         grid: all blocks of a view.
@@ -79,24 +146,10 @@ class Region:
         block: (width, height) of a block in pixels.
         num_blocks: number of blocks A.
         whole: whether images are [H, W, C] instead, for a region made by `full_view`.
+        host: the arrays below in NumPy's memory.
     """
 
-    # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in
-    # memory, its rows.
-    tile: UInt32
-    bit: UInt32
-    x: UInt32
-    y: UInt32
-    place: UInt32
-    rows: UInt32
-    pitch: UInt32  # packets from a row of a block to the next, [1]
-    slot_of: UInt32  # slot of every tile of the view, or NO_SLOT
-    block_table: UInt32  # summed areas of the drawn blocks and of the tiles that have one
-    tile_table: UInt32
-    # Per slot: first pixel of the tile.
-    corner_x: Float
-    corner_y: Float
-    weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
+    block_table: UInt32  # summed areas of the drawn blocks
     _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
     def __init__(
@@ -139,27 +192,35 @@ class Region:
             self.num_pixels = len(x) * bw * bh
             place = np.arange(len(x)) * (bw * bh)
             rows = np.full(len(y), bh)
-        arrays = {
+        self.host = {
             "tile": tile,
             "bit": bit,
             "x": x,
             "y": y,
             # Pixels are read and written in packets of 4 floats: place and pitch count packets.
             "place": place // 4,
-            "pitch": [self.row // 4],
+            "pitch": np.array([self.row // 4]),
             "rows": rows,
             "slot_of": slots,
             "block_table": summed_area(blocks),
             "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
         }
-        for name, values in arrays.items():
-            setattr(self, name, from_numpy(mi.UInt32, values))
-        self.corner_x = from_numpy(mi.Float, tiles % self.across * (ACROSS * bw))
-        self.corner_y = from_numpy(mi.Float, tiles // self.across % self.down * (DOWN * bh))
+        self.host["corner_x"] = np.float32(tiles % self.across * (ACROSS * bw))
+        self.host["corner_y"] = np.float32(tiles // self.across % self.down * (DOWN * bh))
         if valid is None:
-            pixels = np.ones((self.height, self.width), bool)
-            valid = np.ones((), bool) if whole else self.crop(pixels)
+            valid = np.ones((), bool) if whole else self.inside
         self.weights = None if valid.all() else from_numpy(mi.Float, valid)
+
+    def __getattr__(self, name: str) -> Jit:
+        """Return an array, which is uploaded when it is first read: most of them are not, because
+        many regions are only compared, joined or cropped.
+        """
+        values = self.__dict__.get("host", {}).get(name)
+        if values is None:
+            raise AttributeError(f"Region has no attribute {name!r}.")
+        kind = mi.Float if values.dtype == np.float32 else mi.UInt32
+        setattr(self, name, array := from_numpy(kind, values))
+        return array
 
     @classmethod
     def of(cls, mask: np.ndarray, config: RenderConfig | None = None) -> Region:
@@ -167,17 +228,22 @@ class Region:
         grid = BlockGrid(mask.shape[1], mask.shape[0], block_shape(config or RenderConfig()))
         return cls(grid, grid.counts(mask) > 0)
 
-    def shape(self, channels: int) -> tuple[int, ...]:
-        """Return the shape of an image with `channels` floats per pixel on this region."""
-        if self.whole:
-            return self.height, self.width, channels
-        return self.num_blocks, self.block[1], self.block[0], channels
-
     @property
     def mask(self) -> np.ndarray:
         """The drawn pixels, bool [H, W]."""
         width, height = self.block
         return self.drawn.repeat(height, axis=0).repeat(width, axis=1)[: self.height, : self.width]
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Mask of the pixels of the blocks that lie in the view, bool [A, block_height,
+        block_width].
+        """
+        width, height = self.block
+        row, column = self._blocks
+        rows = height * row[:, None] + np.arange(height) < self.height
+        columns = width * column[:, None] + np.arange(width) < self.width
+        return rows[:, :, None] & columns[:, None]
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...],
@@ -217,17 +283,6 @@ class Region:
         blocks[row, :, column] = values
         return blocks.reshape(rows * height, columns * width, *rest)
 
-    def pixels(self, lane: UInt32) -> tuple[UInt32, UInt32]:
-        """Return the coordinates (x, y) in the view of the pixels at some places of an image."""
-        if self.whole:
-            y, x = quotient_and_rest(lane, self.row)
-            return x, y
-        width, height = self.block
-        block = lane // (width * height)
-        within = lane - block * (width * height)
-        x = elements(self.x, block) + within % width
-        return x, elements(self.y, block) + within // width
-
 
 def joined(regions: Sequence[Region]) -> Region:
     """Return the blocks of regions of several views as one region, of the views one below the
@@ -236,22 +291,30 @@ def joined(regions: Sequence[Region]) -> Region:
     Its images are the regions' images, one after the other. Blocks keep the pixel coordinates of
     their view.
     """
+    blocks = stacked([part.drawn for part in regions])
+    views, rows, columns = blocks.shape
     bw, bh = regions[0].block
-    rows, columns = np.max([part.drawn.shape for part in regions], axis=0).tolist()
-    blocks = [
-        np.pad(part.drawn, [(0, rows - part.drawn.shape[0]), (0, columns - part.drawn.shape[1])])
-        for part in regions
-    ]
     grid = BlockGrid(columns * bw, rows * bh, (bw, bh))
-    valid = [part.crop(np.ones((part.height, part.width), bool)) for part in regions]
-    return Region(grid, np.concatenate(blocks), views=len(regions), valid=np.concatenate(valid))
+    valid = np.concatenate([part.inside for part in regions])
+    return Region(grid, blocks.reshape(-1, columns), views=views, valid=valid)
+
+
+def stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Return arrays [rows, columns] as one [V, rows, columns], with zeros after the smaller
+    ones.
+    """
+    shape = np.max([array.shape for array in arrays], axis=0)
+    result = np.zeros((len(arrays), *shape), arrays[0].dtype)
+    for whole, array in zip(result, arrays, strict=True):
+        whole[: array.shape[0], : array.shape[1]] = array
+    return result
 
 
 def summed_area(grid: np.ndarray) -> np.ndarray:
     """Return the number of set cells left of and above every corner of a grid [R, C], flat
     [(R + 1) (C + 1)].
     """
-    return np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).ravel()
+    return np.asarray(cv2.integral(grid.astype(np.uint8))).ravel()
 
 
 def quotient(lane: UInt32, divisor: int) -> UInt32:
@@ -260,21 +323,21 @@ def quotient(lane: UInt32, divisor: int) -> UInt32:
     Adding half a step before the product rounds down correctly: it exceeds the rounding error of a
     double.
     """
-    return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
+    return mi.UInt32((mi.Float64(lane) + 0.5) * opaque(mi.Float64, 1 / divisor))
 
 
 def quotient_and_rest(lane: UInt32, divisor: int) -> tuple[UInt32, UInt32]:
     """Return lane // divisor and lane % divisor, likewise."""
     whole = quotient(lane, divisor)
-    return whole, lane - whole * dr.opaque(mi.UInt32, divisor)
+    return whole, lane - whole * opaque(mi.UInt32, divisor)
 
 
-def on_region(values: Float, region: Region) -> Float:
+def on_region(values: Float, region: DrawnBlocks) -> Float:
     """Return an image [H W] of one float per pixel on the region, 0 outside the view."""
-    x, y = region.pixels(dr.arange(mi.UInt32, region.num_pixels))
-    width = dr.opaque(mi.UInt32, region.width)
-    height = dr.opaque(mi.UInt32, region.height)
-    image = dr.gather(mi.Float, values, y * width + x, active=(x < width) & (y < height))
+    pixel = region.pixels(dr.arange(mi.UInt32, region.num_pixels))
+    size = region.size
+    place = pixel.y * size.x + pixel.x
+    image = dr.gather(mi.Float, values, place, active=dr.all(pixel < size))
     dr.eval(image)
     return image
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
 from morgs_mi.core.color_space import BRIGHTEST
-from morgs_mi.core.config import Positive, config_class
+from morgs_mi.platform.config import Positive, config_class
 
 _Encoded = Annotated[float, Ge(-BRIGHTEST), Le(BRIGHTEST)]
 

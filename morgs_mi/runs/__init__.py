@@ -1,3 +1,1 @@
-"""Whole jobs: fits of captures, live fits, chunks on several machines, imports, the
-demonstration.
-"""
+"""Fits of captures, with their files."""

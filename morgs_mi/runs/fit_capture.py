@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -18,17 +18,19 @@ from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.points import dense_points, match_capture, triangulate_points
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.config import config_or_default
-from morgs_mi.core.extras import extra
-from morgs_mi.core.files import locked_folder
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.view import View, Views
 from morgs_mi.fit.budget import check_capacity
 from morgs_mi.fit.initialise import unseen_points
 from morgs_mi.loop.first_frame import preview
 from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.observation import over_border, prepare
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.extras import extra
+from morgs_mi.platform.files import locked_folder
+from morgs_mi.platform.interrupts import interrupts_raised
+from morgs_mi.platform.progress import Progress, Report, time_left
 from morgs_mi.playback.stream_header import about_lenses, as_fitted
 from morgs_mi.runs.fit_files import (
     FitFiles,
@@ -54,13 +56,13 @@ class FirstFrameProgress:
     report: Report | None  #: Called likewise.
     begin: float = field(default_factory=time.perf_counter)  #: Of the fit, s.
     first_step: float | None = None  #: Begin of the first frame's first step, s.
-    left: float | None = None  #: Seconds of the steps that are left; None before the first one.
+    left: float | None = None  #: Seconds of the steps that are left; None before 3 %.
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         if stage.startswith("First frame"):
             moment = time.perf_counter()
             self.first_step = self.first_step or moment
-            self.left = (moment - self.first_step) * (total - done) / done if done else None
+            self.left = time_left(moment - self.first_step, done, total)
         if self.report is not None:
             self.report(stage, done, total)
 
@@ -100,21 +102,20 @@ def stream_capture(
             can be read, or the stream was removed, moved or replaced meanwhile; the stream is
             complete up to the last frame.
         ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or
-            belongs to another
-        capture or other settings; or images, Gaussians or steps that do not fit in memory.
+            belongs to another capture or other settings; or images, Gaussians or steps that do not
+            fit in memory.
     """
     out = Path(out)
     config = config_or_default("stream_capture()", config, StreamConfig())
     check_outputs(out)
-    check_capacity(
-        "stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit
-    )
+    check_capacity("stream_capture()", capture.views.train.cameras, config.fit)
     watched = FirstFrameProgress(progress)
     stages = Progress(watched)
     with locked_folder(out, "stream_capture()"), ExitStack() as at_end:
         files = FitFiles.of(out)
         at_end.callback(files.provisional.unlink, missing_ok=True)
         first_frame = next(capture.partial_frames(0, 1))
+        config = with_border(capture, first_frame, config)
         metadata = stream_metadata(capture, first_frame, config)
         provisional = ProvisionalFrame(files.provisional, capture, metadata)
 
@@ -125,8 +126,8 @@ def stream_capture(
                 on_provisional(keyframe)
 
         def show_preview(sparse: Capture) -> None:
-            images = first_frame.comparable(sparse.train_views)
-            preview(StreamLoop.of(sparse, config).setup, images, show)
+            setup = StreamLoop.of(sparse, config).setup
+            preview(setup, first_frame.comparable, stages.of("First picture"), show)
 
         earlier = interrupted_fit(files, capture, metadata) if resume else None
         if earlier is None:
@@ -137,7 +138,6 @@ def stream_capture(
             prepared = Prepared(as_fitted(capture, earlier.stream))
             loop = StreamLoop.of(prepared.capture, config)
             frames = _resumed(loop, prepared.capture, earlier, stages)
-        train = prepared.capture.train_views
         last = prepared.capture.num_frames - 1
         later_frames = stages.of("Later frames")
         metadata |= about_lenses(prepared.capture)
@@ -145,7 +145,7 @@ def stream_capture(
         with Recording(files, prepared.capture, metadata, earlier) as recording:
             for frame, upcoming in with_next(frames):
                 stage = later_frames.part(frame.index - 1, last) if frame.index else stages
-                packet, report = push_frame(loop, frame, train, stage.report, upcoming, show)
+                packet, report = push_frame(loop, frame, stage.report, upcoming, show)
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 report = replace(report, fingerprints=image_fingerprints(frame.images))
                 recording.push(packet, report, loop.state.coded)
@@ -158,17 +158,16 @@ def _resumed(
     """Let a loop continue after an interrupted fit, and return the frames that follow."""
     fit = loop.setup.config.fit
     last_frame = earlier.coded.frame
-    train = capture.train_views
     # Changes and exposures are relative to references that depend on all images so far.
     start = 0 if fit.skip_static or fit.exposure != "off" else last_frame
     frames = capture.partial_frames(start)
     count = last_frame + 1 - start
     reading = progress.of("Reading the fitted frames")
 
-    def images() -> Iterator[list[np.ndarray | None]]:
+    def images() -> Iterator[Views[View]]:
         for done, frame in enumerate(islice(frames, count)):
             reading(done, count)
-            yield frame.comparable(train)
+            yield frame.comparable
 
     loop.resume(earlier.coded, images(), earlier.reports[0].exposures)
     return frames
@@ -201,7 +200,7 @@ class Prepared:
         if config.fit.refine_cameras == "off":
             return cls(capture)
         stage = progress.of("Refining cameras")
-        refine_cameras = extra("camera refinement", "first frame")
+        refine_cameras = extra("cameras", "refine")
         capture, refinement = refine_cameras(capture, config.fit, config.render, config.seed, stage)
         return cls(capture, refinement.validation)
 
@@ -239,6 +238,15 @@ def begin_as(source: Path, out: Path, capture: Capture, metadata: dict[str, Any]
         recording.extend([next(iter(stream))], read_reports(files.report, range(1)))
 
 
+def with_border(capture: Capture, first: PartialFrame, config: StreamConfig) -> StreamConfig:
+    """Return the settings of a fit of a capture, without points and a background with that of its
+    first frame (see `over_border`).
+    """
+    cloud = capture.points, capture.point_colors
+    setup = prepare(capture.views.train, *cloud, config, capture.display_exposure)
+    return over_border(setup, first.train).config
+
+
 def with_points(
     capture: Capture,
     seed: int,
@@ -254,8 +262,7 @@ def with_points(
         progress: of the stages.
         on_sparse: called with the capture with triangulated points alone, if they are more.
     """
-    train_cameras = [capture.cameras[view] for view in capture.train_views]
-    if problem := unseen_points(train_cameras, capture.points):
+    if problem := unseen_points(capture.views.train.cameras, capture.points):
         _LOG.warning("%s: %s.", capture.path, problem)
         none = np.zeros((0, 3))
         capture = replace(capture, points=none, point_colors=none)
@@ -272,23 +279,19 @@ def with_points(
 def push_frame(
     loop: StreamLoop,
     frame: PartialFrame,
-    train: Sequence[int],
     progress: Report | None = None,
     upcoming: PartialFrame | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[Packet, FrameReport]:
-    """Fit the next frame of a loop on the views `train`; the report's status names the images that
-    are missing.
+    """Fit the next frame of a loop; the report's status names the images that are missing.
 
     Raises:
         OSError: none of them could be read.
         ValueError: as `StreamLoop.push`.
     """
-    frame.check_images(train)
-    images = [frame.images[view] for view in train]
-    ahead = None if upcoming is None else [upcoming.images[view] for view in train]
-    recorded = None if frame.recorded is None else frame.comparable(train)
-    packet, report = loop.push(images, progress, ahead, recorded, on_provisional)
+    ahead = None if upcoming is None else upcoming.views.train
+    recorded = None if frame.recorded is None else frame.comparable
+    packet, report = loop.push(frame.train, progress, ahead, recorded, on_provisional)
     problems = [report.status] if report.status != "ok" else []
     return packet, replace(report, status="; ".join([*problems, *frame.problems]) or "ok")
 

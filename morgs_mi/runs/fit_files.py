@@ -40,9 +40,13 @@ from morgs_mi.codec.container import (
 )
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import Entry, StreamReader
-from morgs_mi.core.bounded import read_json
 from morgs_mi.core.color_space import TRANSFER
-from morgs_mi.core.files import (
+from morgs_mi.core.rig import choose_key_views
+from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.exposure import Exposure
+from morgs_mi.platform.bounded import JsonObject, read_json
+from morgs_mi.platform.files import (
     CAPTURE,
     PROVISIONAL,
     REPORT,
@@ -51,10 +55,6 @@ from morgs_mi.core.files import (
     is_same_file,
     write_json,
 )
-from morgs_mi.core.rig import choose_key_views
-from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.exposure import Exposure
 
 _LOG = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ class ProvisionalFrame:
 
     path: Path  #: File of the frame; one of an earlier fit is removed.
     capture: Capture  #: Cameras and frame rate of the stream's header.
-    metadata: Mapping[str, Any]  #: Other entries of the header, from `stream_metadata`.
+    metadata: JsonObject  #: Other entries of the header, from `stream_metadata`.
     is_shown: bool = True  #: False after it could not be written.
 
     def __post_init__(self) -> None:
@@ -172,7 +172,7 @@ class Recording:
         self,
         files: FitFiles,
         capture: Capture,
-        metadata: Mapping[str, Any],
+        metadata: JsonObject,
         earlier: Interrupted | None = None,
     ) -> None:
         self._files = files
@@ -271,7 +271,7 @@ class Interrupted:
 def interrupted_fit(
     files: FitFiles,
     capture: Capture,
-    metadata: Mapping[str, Any],
+    metadata: JsonObject,
     first: int = 0,
 ) -> Interrupted | None:
     """Return an interrupted fit, None if it has no complete packet yet, or none that it can
@@ -327,7 +327,7 @@ def restart_of(previous_state: CodedFrame | None, last: Packet) -> tuple[bytes, 
     )
 
 
-def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
+def check_same_fit(stream: StreamReader, capture: Capture, metadata: JsonObject) -> None:
     """Check that a stream to resume has the header that a fit would write.
 
     Raises:
@@ -350,12 +350,12 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
         )
 
 
-def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
+def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> JsonObject:
     """Return the entries of the stream's header about the fit; they must agree for a fit to be
     resumed.
     """
     train = capture.train_views
-    key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
+    key_views = choose_key_views(capture.views.train.cameras, config.motion.key_views)
     motion = replace(
         config.motion,
         flow_method=_without_folder(config.motion.flow_method),

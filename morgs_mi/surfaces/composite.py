@@ -19,12 +19,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.color_space import decode_traced, encode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians, read_columns
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Jit, Tensor
+from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.channels import NORMALISED
-from morgs_mi.render.rasterize import Image, rasterize
+from morgs_mi.render.rasterize import Image, rasterize, render_view
 from morgs_mi.render.region import Region
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.surface_view import Crop, SurfaceView
@@ -109,15 +110,14 @@ def _in_front(
     Only the blocks of pixels in which a surface is seen are drawn.
     """
     camera = view.pixels.camera
-    x, y, width, height = view.pixels.crop
+    pixels = view.pixels.crop.slices
     limit = np.full((camera.height, camera.width), np.inf, np.float32)
-    pixels = np.s_[y : y + height, x : x + width]
-    limit[pixels] = np.array(view.depth).reshape(height, width)
+    limit[pixels] = np.array(view.depth).reshape(limit[pixels].shape)
     mask = np.isfinite(limit)
     if not mask.any():
         return None
     region = Region.of(mask)
-    part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=limit)
+    part = render_view(gaussians, ActiveView(camera, config, region), channels, depth_limit=limit)
     index_image = region.uncropped(np.arange(region.num_pixels).reshape(region.shape(1)[:3]))
     index = from_numpy(mi.UInt32, index_image[pixels])
     has_surface = view.coverage > 0
@@ -142,9 +142,8 @@ def _blended(
 
 
 def cropped(image: Tensor, crop: Crop) -> list[Float]:
-    """Return the columns [P] of an image [H, W, C] on a crop (x, y, width, height)."""
-    x, y, width, height = crop
-    return [image[y : y + height, x : x + width, k].array for k in range(image.shape[2])]
+    """Return the columns [P] of an image [H, W, C] on a crop."""
+    return [image[(*crop.slices, k)].array for k in range(image.shape[2])]
 
 
 def _ratio(sums: list[Float], weight: Float) -> list[Float]:

@@ -14,14 +14,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.arrays import refuse_freezing
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, shape_attribute_widths
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import bounded, errors_at
 from morgs_mi.core.color_space import decode_traced
-from morgs_mi.core.config import check_value
 from morgs_mi.core.gaussians import tensor_rows
-from morgs_mi.core.memory import refuse_freezing
 from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.platform.checks import bounded, errors_at
+from morgs_mi.platform.config import check_value
 from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
@@ -58,7 +58,7 @@ class _SceneGaussians(SimpleNamespace):
         return tensor_rows(getattr(self, name), index)
 
 
-def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
+def _scene_gaussians(scene: mi.Scene, attributes: list[str]) -> _SceneGaussians:
     """Return the Gaussians of all shapes, padded with zeros to the largest number of SH
     coefficients.
     """
@@ -74,7 +74,7 @@ def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
     return _SceneGaussians(**parts[0])
 
 
-def _property_problems(background: Any, aovs: list[str], surfaces: Any) -> Iterator[str]:
+def _property_problems(background: Any, aovs: list[str], surfaces: object) -> Iterator[str]:
     """Yield a sentence for each property of the plugin that is refused."""
     values = np.ravel(background)
     is_image = np.ndim(background) > 1
@@ -112,7 +112,7 @@ def _property_problems(background: Any, aovs: list[str], surfaces: Any) -> Itera
 
 
 def _scene_problems(
-    scene: Any, film: Any, num_views: int, border: int, with_surfaces: bool
+    scene: mi.Scene, film: mi.Film, num_views: int, border: int, with_surfaces: bool
 ) -> Iterator[str]:
     """Yield a sentence for each part of a scene that cannot be rendered."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -132,7 +132,7 @@ def _scene_problems(
         yield "expected a scene with an `ellipsoids` shape, got none; add one"
 
 
-def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
+def _shape_gaussians(shape: mi.Shape, attributes: list[str]) -> dict[str, Tensor]:
     """Return a shape's attributes by the rasteriser's names, attached to its parameters."""
     params: Any = mi.traverse(shape)
     data = mi.TensorXf(params["data"], (dr.width(params["data"]) // 10, 10))
@@ -160,7 +160,7 @@ class _ForwardPass(NamedTuple):
     """
 
     inputs: list[Any]
-    image: Any
+    image: Tensor
 
     def fits(self, inputs: list[Any]) -> bool:
         """Return whether the inputs are the same numbers and the same Dr.Jit variables as those of
@@ -185,7 +185,7 @@ def _leaves(value: Any) -> list[Any]:
     )
 
 
-def _views(sensor: Any) -> list[Any]:
+def _views(sensor: mi.Sensor) -> list[mi.Sensor]:
     """Return the sensors of a `batch`, which are beside each other on its film, or the sensor
     itself.
     """
@@ -196,7 +196,7 @@ def _views(sensor: Any) -> list[Any]:
     return [part for part in children if isinstance(part, mi.Sensor)]
 
 
-def _sensor_camera(sensor: Any, border: int) -> Camera:
+def _sensor_camera(sensor: mi.Sensor, border: int) -> Camera:
     """Return the camera of the sensor's whole film with a margin of `border` pixels."""
     view = Camera.from_sensor(sensor)
     params: Any = mi.traverse(sensor)
@@ -214,10 +214,12 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
     # Mitsuba's camera has x to the left and y up.
     viewmat = world_to_sensor * mi.TensorXf([-1, -1, 1, 1], (4, 1))
     size = (W + 2 * border, H + 2 * border)
-    return AttachedCamera(K, viewmat, *size, view.name, view.near, intrinsics=(f, f, cx, cy))
+    focal = mi.Vector2f(f)
+    center = mi.Point2f(cx, cy)
+    return AttachedCamera(K, viewmat, *size, view.name, view.near, focal=focal, center=center)
 
 
-def _sensor_of(scene: Any, sensor: Any) -> Any:
+def _sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
     """Return a sensor, which may be given by its number in the scene."""
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
@@ -303,7 +305,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         if self.background is not None:
             callback.put("background", self.background, mi.ParamFlags.Differentiable)
 
@@ -325,13 +327,13 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def render(
         self,
-        scene: Any,
-        sensor: Any = 0,
-        seed: Any = 0,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: UInt32 = 0,
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
-    ) -> Any:
+    ) -> Tensor:
         # Before any memory is released, which would end the process.
         refuse_freezing("gaussian_splat")
         self.forward_pass = None
@@ -351,8 +353,13 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         return image
 
     def render_forward(
-        self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
-    ) -> Any:
+        self,
+        scene: mi.Scene,
+        params: Any,
+        sensor: int | mi.Sensor = 0,
+        seed: UInt32 = 0,
+        spp: int = 0,
+    ) -> Tensor:
         with dr.resume_grad():
             film, surfaces = self._expose(scene, sensor, seed, spp)
             image = film.develop()
@@ -363,7 +370,13 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             return dr.grad(image)
 
     def render_backward(
-        self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: Tensor,
+        sensor: int | mi.Sensor = 0,
+        seed: UInt32 = 0,
+        spp: int = 0,
     ) -> None:
         forward_pass = self.forward_pass
         self.forward_pass = None
@@ -380,7 +393,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             if surfaces is not None:
                 surfaces.backward(params)
 
-    def _inputs(self, scene: Any, sensor: Any) -> list[Any]:
+    def _inputs(self, scene: mi.Scene, sensor: int | mi.Sensor) -> list[Any]:
         """Return all values that an image depends on, but for the integrator's fixed settings."""
         parts = (_sensor_of(scene, sensor), *ellipsoids_of(scene))
         tables: list[Any] = [mi.traverse(part) for part in parts]
@@ -388,8 +401,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         return [leaf for value in [*values, self.background] for leaf in _leaves(value)]
 
     def _expose(
-        self, scene: Any, sensor: Any, seed: Any, spp: int
-    ) -> tuple[Any, SurfaceView | None]:
+        self, scene: mi.Scene, sensor: int | mi.Sensor, seed: UInt32, spp: int
+    ) -> tuple[mi.Film, SurfaceView | None]:
         """Render the scene to the sensor's film and return the film, and the surfaces if there are
         any.
         """
@@ -407,9 +420,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
         # Cropped after rendering: the projection's linearisation depends on the extent of the whole
         # view.
-        x, y = map(int, film.crop_offset())
-        width, height = map(int, film.crop_size() + 2 * border)
-        crop = (x, y, width, height)
+        crop = Crop(film.crop_offset(), film.crop_size() + 2 * border)
 
         self._warn(scene, gaussians)
         surfaces = None
@@ -431,10 +442,10 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
         film.prepare(self.aov_names())
         block = film.create_block()
-        index = dr.arange(mi.UInt32, width * height)
-        place = mi.Point2f(index % width, index // width)
+        index = dr.arange(mi.UInt32, crop.count)
+        place = mi.Point2f(index % crop.size.x, index // crop.size.x)
         block.set_coalesce(False)  # useful for many samples per pixel only
-        block.put(place + mi.Point2f(x, y) + (0.5 - border), values)
+        block.put(place + mi.Point2f(crop.offset) + (0.5 - border), values)
         film.put_block(block)
         return film, surfaces
 
@@ -450,7 +461,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         """
         camera = cameras if len(cameras) > 1 else cameras[0]
         image = rasterize(gaussians, camera, channels, self.background, config=self.config)
-        images: dict[str, Any] = {name: image[name] for name in channels}
+        images: dict[str, Tensor] = {name: image[name] for name in channels}
         if len(cameras) > 1:
             count = range(len(cameras))
             images = {
@@ -461,7 +472,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             columns["color"] = [decode_traced(value) for value in columns["color"]]
         return columns
 
-    def _warn(self, scene: Any, gaussians: _SceneGaussians) -> None:
+    def _warn(self, scene: mi.Scene, gaussians: _SceneGaussians) -> None:
         """Log what the image leaves out, once."""
         sentences = []
         if scene.emitters() and self.surfaces is None:
@@ -469,7 +480,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
                 "gaussian_splat ignores the scene's emitters; set its `background` colour instead."
             )
         opacities = dr.detach(gaussians.opacities.array)
-        outside: Any = dr.count((opacities < 0) | (opacities > 1))
+        outside: UInt32 = dr.count((opacities < 0) | (opacities > 1))
         if count := int(outside[0]):
             sentences.append(
                 f"gaussian_splat: `opacities` must be in [0, 1], got {count} values outside: "

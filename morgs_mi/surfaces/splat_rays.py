@@ -27,10 +27,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.core.config import config_or_default
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.gaussians import ActivatedGaussians, require_some
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Bool, Float, Jit, UInt32
+from morgs_mi.core.types import Bool, Color3f, Float, Jit, UInt32
+from morgs_mi.platform.config import config_or_default
 from morgs_mi.render.projection import FARTHEST
 from morgs_mi.render.render_config import RenderConfig
 
@@ -92,7 +92,7 @@ class _Tree:
         signs = zip(ray.d, self.flips, strict=True)
         flip = sum((dr.select(d < 0, bits, 0) for d, bits in signs), mi.UInt32(0))
 
-        def step(node: UInt32, level: UInt32, state: Jit) -> tuple[Any, ...]:
+        def step(node: UInt32, level: UInt32, state: Jit) -> tuple[Jit, ...]:
             actual = node ^ (flip >> (self.depth - level))
             corners = (dr.gather(mi.Vector4f, self.boxes, 2 * actual + k) for k in range(2))
             # A ray in the plane of a face gives NaN, which minimum and maximum ignore.
@@ -195,7 +195,7 @@ class SplatRays:
         self._coeffs = from_numpy(mi.Float, colors[index])
         self._degree = round(sqrt(coeffs.shape[1])) - 1
 
-    def transmittance(self, ray: Any, active: Bool = True) -> Float:
+    def transmittance(self, ray: mi.Ray3f, active: Bool = True) -> Float:
         """Return the fraction of light that passes the Gaussians along rays [M].
 
         Args:
@@ -213,7 +213,7 @@ class SplatRays:
             ray = mi.Ray3f(dr.detach(ray))
             return self._tree.walk(ray, mi.Bool(active), (mi.Float(1),), visit, span)[0]
 
-    def trace(self, ray: Any, active: Bool = True) -> tuple[Any, Float]:
+    def trace(self, ray: mi.Ray3f, active: Bool = True) -> tuple[Color3f, Float]:
         """Return the colour, weighted as in `rasterize`, and the transmittance of the Gaussians
         along rays [M].
 
@@ -227,7 +227,9 @@ class SplatRays:
             ray = mi.Ray3f(dr.detach(ray))
             basis = dr.sh_eval(ray.d, self._degree)
 
-            def blend(color: Any, transmittance: Float, nearest: Any, last: Any) -> tuple[Any, ...]:
+            def blend(
+                color: Color3f, transmittance: Float, nearest: Jit, last: Jit
+            ) -> tuple[Jit, ...]:
                 ((depth, *depths), (row, *rows), count) = nearest
                 alpha = self._response(ray, row)[1]
                 color = color + transmittance * alpha * self._color(basis, row)
@@ -235,8 +237,8 @@ class SplatRays:
                 return color, transmittance * (1 - alpha), queue, (depth, row)
 
             def advance(
-                active: Bool, color: Any, transmittance: Float, last: Any
-            ) -> tuple[Any, ...]:
+                active: Bool, color: Color3f, transmittance: Float, last: Jit
+            ) -> tuple[Jit, ...]:
                 nearest = self._nearest(ray, active, last)
                 color, transmittance, nearest, last = dr.while_loop(
                     (color, transmittance, nearest, last),
@@ -264,7 +266,7 @@ class SplatRays:
         return transmittance >= self._config.stop_transmittance
 
     def _nearest(
-        self, ray: Any, active: Bool, last: tuple[Float, UInt32]
+        self, ray: mi.Ray3f, active: Bool, last: tuple[Float, UInt32]
     ) -> tuple[list[Float], list[UInt32], UInt32]:
         """Return depths and rows of the next Gaussians after `last`, ordered by both, and how many
         were found.
@@ -295,7 +297,7 @@ class SplatRays:
         start = ([mi.Float(dr.inf)] * _SORTED, [mi.UInt32(0)] * _SORTED, mi.UInt32(0))
         return self._tree.walk(ray, active, start, visit, span)
 
-    def _response(self, ray: Any, row: UInt32) -> tuple[Float, Float]:
+    def _response(self, ray: mi.Ray3f, row: UInt32) -> tuple[Float, Float]:
         """Return the depth of a Gaussian's largest response along rays, and its alpha on the
         segment.
         """
@@ -316,7 +318,7 @@ class SplatRays:
         )
         return depth, 1 - dr.exp2(segment_share * dr.log2(1 - alpha))
 
-    def _color(self, basis: list[Float], row: UInt32) -> Any:
+    def _color(self, basis: list[Float], row: UInt32) -> Color3f:
         """Return max(0.5 + SH, 0) of a Gaussian."""
         K = len(basis)
         total = mi.Color3f(0.5)

@@ -20,17 +20,33 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
-from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.core.types import Color3f, Float, Tensor, UInt32, Vector2f
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.splat_rays import SplatRays
 
 _log = logging.getLogger(__name__)
-
-Crop = tuple[int, int, int, int]
-"""Pixels of a view: (x, y, width, height)."""
-
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Pixels of a view, row by row."""
+
+    offset: mi.ScalarPoint2u  #: First pixel (x, y).
+    size: mi.ScalarVector2u  #: Width and height.
+
+    @property
+    def count(self) -> int:
+        """Number of pixels P."""
+        return self.size.x * self.size.y
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """The rows and columns in an image of the view."""
+        x, y = self.offset
+        width, height = self.size
+        return slice(y, y + height), slice(x, x + width)
 
 
 def rays_for(
@@ -60,12 +76,12 @@ def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[No
         integrator.splats = None
 
 
-def ellipsoids_of(scene: Any) -> list[Any]:
+def ellipsoids_of(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes of a scene that are Gaussians."""
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
 
 
-def surface_scene(scene: Any) -> Any:
+def surface_scene(scene: mi.Scene) -> mi.Scene | None:
     """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces
     nor an environment.
 
@@ -99,7 +115,7 @@ def surface_scene(scene: Any) -> Any:
     return shared_scene([*surfaces, *lights(scene)], scene)
 
 
-def lights(scene: Any) -> list[Any]:
+def lights(scene: mi.Scene) -> list[mi.Object]:
     """Return the emitters of a scene, without the emitters on its surfaces."""
     return [
         emitter
@@ -108,7 +124,7 @@ def lights(scene: Any) -> list[Any]:
     ]
 
 
-def shared_scene(parts: list[Any], whole: Any) -> Any:
+def shared_scene(parts: list[mi.Object], whole: mi.Scene) -> mi.Scene:
     """Return a scene of some shapes and emitters of a whole scene, which does not change.
 
     A new scene names its parts, and sets the extent of an environment to its own; both are set
@@ -123,7 +139,7 @@ def shared_scene(parts: list[Any], whole: Any) -> Any:
     return scene
 
 
-def _attached(thing: Any) -> list[str]:
+def _attached(thing: mi.Object) -> list[str]:
     """Return the names of the parameters of a scene or shape that are attached to the gradient
     graph.
     """
@@ -132,7 +148,7 @@ def _attached(thing: Any) -> list[str]:
 
 
 @contextmanager
-def _detached(shapes: list[Any]) -> Iterator[None]:
+def _detached(shapes: list[mi.Shape]) -> Iterator[None]:
     """Detach the parameters of shapes inside the context.
 
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
@@ -154,29 +170,33 @@ class SampledPixels:
     """Pixels of a view, and the samples of an integrator in them."""
 
     camera: Camera  #: The view.
-    crop: Crop  #: Its pixels, (x, y, width, height), P in all.
-    template: Any  #: Sensor with the sampler and the far plane.
+    crop: Crop  #: Its pixels, P in all.
+    template: mi.Sensor  #: Sensor with the sampler and the far plane.
     seed: int = 0  #: Seed of the samples.
     spp: int = 0  #: Samples per pixel; 0: the sampler's number.
 
-    def sensor(self) -> Any:
+    def sensor(self) -> mi.Sensor:
         """Return a sensor with a film of the pixels."""
-        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         params: Any = mi.traverse(self.template)
         more = {"far_clip": float(params["far_clip"]), "sampler": self.template.sampler()}
-        crop = dict(zip(names, self.crop, strict=True))
-        return mi.load_dict({**self.camera.sensor(pixel_format="rgba", **crop), **more})
+        film = {
+            "crop_offset_x": self.crop.offset.x,
+            "crop_offset_y": self.crop.offset.y,
+            "crop_width": self.crop.size.x,
+            "crop_height": self.crop.size.y,
+        }
+        return mi.load_dict({**self.camera.sensor(pixel_format="rgba", **film), **more})
 
 
 @dataclass(frozen=True)
 class SurfaceView:
     """Surfaces as seen by one camera, P pixels row by row."""
 
-    scene: Any  #: The surfaces, see `surface_scene`.
-    gaussians: list[Any]  #: The other shapes.
+    scene: mi.Scene  #: The surfaces, see `surface_scene`.
+    gaussians: list[mi.Shape]  #: The other shapes.
     integrator: Any  #: Renders them.
     pixels: SampledPixels  #: The pixels and their samples.
-    sensor: Any  #: The camera, with a film of those pixels.
+    sensor: mi.Sensor  #: The camera, with a film of those pixels.
     #: Radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the
     #: gradient graph.
     image: Tensor
@@ -185,14 +205,14 @@ class SurfaceView:
     depth: Float
     #: Radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient
     #: graph; None if there is none, or the integrator hides it.
-    behind: Any
+    behind: Color3f
     #: The Gaussians, for an integrator that traces rays through them; None for other integrators.
     splats: SplatRays | None
     srgb: bool  #: Whether their colours are sRGB-encoded.
 
     @staticmethod
     def of(
-        whole: Any,
+        whole: mi.Scene,
         integrator: Any,
         pixels: SampledPixels,
         splats: ActivatedGaussians,
@@ -268,7 +288,7 @@ class SurfaceView:
             # `values` may be a parameter itself: its gradient is added to.
             dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
 
-    def _attached_environment(self) -> Any:
+    def _attached_environment(self) -> Color3f | None:
         """Return the radiance of the environment that the parameters give; None if there is none,
         or it is not differentiated.
         """
@@ -297,7 +317,9 @@ class SurfaceView:
         return bool(attached)
 
 
-def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> tuple[Float, Float]:
+def coverage_and_depth(
+    scene: Any, sensor: mi.Sensor, camera: Camera, crop: Crop
+) -> tuple[Float, Float]:
     """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a
     regular grid.
 
@@ -305,18 +327,19 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
         scene: the surfaces.
         sensor: a camera's sensor, with a film of the pixels of `crop`.
         camera: the same camera.
-        crop: pixels of the camera's image, (x, y, width, height), P in all.
+        crop: pixels of the camera's image, P in all.
     """
-    coverage = dr.zeros(mi.Float, crop[2] * crop[3])
-    depth = dr.full(mi.Float, dr.inf, crop[2] * crop[3])
-    first, (across, down) = _rectangle(scene.bbox(), camera, crop)
-    if not across * down:
+    coverage = dr.zeros(mi.Float, crop.count)
+    depth = dr.full(mi.Float, dr.inf, crop.count)
+    box = _rectangle(scene.bbox(), camera, crop)
+    if not box.count:
         return coverage, depth
-    lane: UInt32 = dr.arange(mi.UInt32, across * down)
-    columns: UInt32 = dr.opaque(mi.UInt32, across)
+    lane: UInt32 = dr.arange(mi.UInt32, box.count)
+    columns: UInt32 = dr.opaque(mi.UInt32, box.size.x)
     row = lane // columns
     column = lane - row * columns
-    pixel = (row + first[1]) * dr.opaque(mi.UInt32, crop[2]) + column + first[0]
+    width: UInt32 = dr.opaque(mi.UInt32, crop.size.x)
+    pixel = (row + box.offset.y) * width + column + box.offset.x
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
@@ -337,23 +360,21 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: Crop) -> t
     return coverage, depth
 
 
-def _rectangle(box: Any, camera: Camera, crop: Crop) -> tuple[list[int], list[int]]:
-    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from
-    there, (x, y).
-    """
+def _rectangle(box: Any, camera: Camera, crop: Crop) -> Crop:
+    """Return the pixels of a crop that a bounding box may reach, counted from the crop's first."""
     if not box.valid():  # no surface
-        return [0, 0], [0, 0]
+        return Crop(mi.ScalarPoint2u(0), mi.ScalarVector2u(0))
     ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
     pixels, depths = camera.project(np.array(list(product(*ends.T))))
     low = np.zeros(2)
-    high = np.array(crop[2:])
+    high = np.array(crop.size)
     if (depths >= camera.near).all():
         ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
-        low, high = np.clip(ends - crop[:2], 0, high)
-    return low.astype(int).tolist(), (high - low).astype(int).tolist()
+        low, high = np.clip(ends - np.array(crop.offset), 0, high)
+    return Crop(mi.ScalarPoint2u(low.astype(int)), mi.ScalarVector2u((high - low).astype(int)))
 
 
-def _environment(scene: Any, sensor: Any) -> Any:
+def _environment(scene: mi.Scene, sensor: mi.Sensor) -> Color3f:
     """Return the radiance of the environment behind every pixel's centre."""
     pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
     rays = _rays(sensor, pixel, mi.Point2f(0.5))
@@ -363,7 +384,7 @@ def _environment(scene: Any, sensor: Any) -> Any:
     return mi.Color3f(mi.unpolarized_spectrum(scene.environment().eval(si)))
 
 
-def _rays(sensor: Any, pixel: UInt32, offset: Any) -> Any:
+def _rays(sensor: Any, pixel: UInt32, offset: Vector2f) -> mi.Ray3f:
     """Return rays through the positions `offset` [0, 1]^2 of pixels of a sensor's film, numbered
     row by row.
     """

@@ -1,6 +1,8 @@
 """Motion models of other publications, times, and pictures, at a tiny size."""
 
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,12 +20,14 @@ from benchmarks.speed import (
     stages,
     step_parts,
 )
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
 from tests.scenes.recording import CONFIG, recording
 from tests.scenes.shifted_ball import PLAIN, SHIFT, fit_shifted
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", ["hicom", "cache", "grid", "grid-slow", "anchors"])
@@ -48,6 +52,13 @@ def test_stages__have_all_seconds_of_a_frame(monkeypatch):
     assert sum(row["seconds"] for row in rows.values()) == pytest.approx(total["seconds"], rel=0.02)
     assert rows["steps"]["passes"] == 2 * 3  # rendered and differentiated
     assert "| steps |" in stages.table({"tiny": rows | {"total": total}})
+
+
+def test_host__counts_the_operations_of_a_frame_and_of_a_step(tmp_path):
+    """In a process of its own, see `HostCounts`."""
+    command = [sys.executable, "-m", "tests.benchmarks.count_host", str(tmp_path / "plot.png")]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
 
 
 def test_growth__measures_a_tiny_scene():

@@ -19,9 +19,9 @@ from benchmarks.reports.needed import (
     sets_table,
 )
 from benchmarks.reports.trial_rule import SEEDS, compared, next_fit, trials_of, verdict
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.files import write_json
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.files import write_json
 
 PACKAGE = Path(morgs_mi.__file__).parent
 CONFIG = StreamConfig()

@@ -14,9 +14,9 @@ from benchmarks.reports.tracks import track_scores
 from morgs_mi import RenderConfig, SynthConfig, load_capture, synthesize
 from morgs_mi.capture.truth import Tracks, save_tracks
 from morgs_mi.codec.frame_source import FrameState
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.files import write_json
 from morgs_mi.runs.fit_capture import stream_capture
 from tests.quick import quick
 from tests.scenes.moving_splats import moved

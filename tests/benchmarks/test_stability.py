@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.reports import stability
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 from tests.scenes.extremes import DISTANCES, NEEDLES, REFUSED
 from tests.scenes.hard_fits import HARD_FITS
 

@@ -320,6 +320,46 @@ QUALISYS = {
         r"expected one file \*.qca.txt, got old.qca.txt, rig.qca.txt; keep",
     ),
 }
+EASYMOCAP = {
+    "no intrinsics": (missing("intri.yml"), "intri.yml: expected the intrinsics, found none; copy"),
+    "broken file": (truncated("extri.yml"), "extri.yml: expected OpenCV's YAML, got a broken file"),
+    "no map": (
+        lambda path: (path / "intri.yml").write_text("%YAML:1.0\n---\n- 1\n"),
+        "intri.yml: expected OpenCV's YAML, got a broken file; export it again",
+    ),
+    "nested lists": (
+        lambda path: (path / "intri.yml").write_text("%YAML:1.0\n---\na: " + "[" * 90_000),
+        "intri.yml: expected at most 10000 lists, got 90000",
+    ),
+    "infinite translation": (
+        replace("extri.yml", "data: [ 0., 0., ", "data: [ .Inf, 0., "),
+        r"extri.yml: `T_1` must be a matrix of 3 finite numbers, got \[\[inf\], .*; calibrate this",
+    ),
+    "no poses": (
+        lambda path: (path / "extri.yml").write_text("%YAML:1.0\n---\na: 1\n"),
+        "extri.yml: expected `T_NN` for each camera NN, got none; export it again",
+    ),
+    "no camera": (
+        replace("intri.yml", "K_2:", "P_2:"),
+        "intri.yml: `K_2` must be a matrix of 9 finite numbers, got none that can be read; calib",
+    ),
+    "number": (
+        replace("intri.yml", "K_1: !!opencv-matrix", "K_1: 3\nP: !!opencv-matrix"),
+        "intri.yml: `K_1` must be a matrix of 9 finite numbers, got none",
+    ),
+    "short matrix": (
+        replace("extri.yml", ", -0.44721359549995793 ]", " ]"),
+        "extri.yml: `Rot_1` must be a matrix of 9 finite numbers, got none",
+    ),
+    "no rotation": (
+        replace("extri.yml", "data: [ 0., 1.", "data: [ 2., 1."),
+        "extri.yml, camera 1: the axes must be a right-handed orthonormal frame",
+    ),
+    "infinite size": (
+        replace("intri.yml", "K_1:", "W_1: .Inf\nK_1:"),
+        "intri.yml, camera 1: cannot convert float infinity",
+    ),
+}
 LAYOUTS = {
     "poses_bounds": (layouts.n3dv, POSES_BOUNDS),
     "by frame": (lambda path: layouts.meet_room(path, layouts.folder_per_frame), BY_FRAME),
@@ -328,6 +368,7 @@ LAYOUTS = {
     "Dynamic 3D Gaussians": (layouts.dynamic3dgs, DYNAMIC3DGS),
     "Anipose": (layouts.anipose, ANIPOSE),
     "Qualisys": (layouts.qualisys, QUALISYS),
+    "EasyMocap": (layouts.easymocap, EASYMOCAP),
 }
 
 

@@ -7,6 +7,7 @@ from tests.scenes.captures import (
     anipose,
     colmap,
     dynamic3dgs,
+    easymocap,
     meet_room,
     n3dv,
     nerfstudio,
@@ -15,7 +16,7 @@ from tests.scenes.captures import (
 
 
 @pytest.mark.parametrize(
-    "build", [colmap, nerfstudio, dynamic3dgs, n3dv, meet_room, anipose, qualisys]
+    "build", [colmap, nerfstudio, dynamic3dgs, n3dv, meet_room, anipose, qualisys, easymocap]
 )
 def test_check_output__refuses_captures_of_every_layout(tmp_path, build):
     capture = build(tmp_path / "clip")

@@ -69,8 +69,8 @@ def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path):
     assert frame_numbers(capture) == [[80, 30], [120, 80], [160, 120]]
     assert [camera.delay for camera in capture.cameras] == [0, 0.25]
     first, second = list(capture.partial_frames())[:2]
-    assert [int(image[0, 0, 1]) for image in first.comparable((0, 1))] == [80, 40]
-    assert [int(image[0, 0, 1]) for image in second.comparable((1,))] == [80]
+    assert [int(view.image[0, 0, 1]) for view in first.comparable] == [80, 40]
+    assert [int(view.image[0, 0, 1]) for view in second.comparable] == [120, 80]
     assert [int(image[0, 0, 1]) for image in capture.images(1)] == [40, 80, 120]
     capture = load_capture(path, reading=ReadConfig(offset={"a": 1.5, "b": 2}))
     assert frame_numbers(capture) == [[20, 40], [80, 80], [120, 120], [160, 160]]

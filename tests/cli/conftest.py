@@ -1,5 +1,7 @@
 """The command line in this process, and a capture and a stream to run it on."""
 
+import json
+
 import pytest
 
 from morgs_mi.cli.main import main
@@ -36,3 +38,10 @@ def stream(tmp_path):
         writer.write(keyframe_packet(splat, 0))
         writer.write(keyframe_packet(splat, 1))
     return path
+
+
+@pytest.fixture
+def far_cameras():
+    """The report of a fit of cameras that are far apart."""
+    row = {"frame": 0, "seconds": 1, "validation": {"quality": "poor", "spacing": 58.4}}
+    return json.dumps({"frames": [row]})

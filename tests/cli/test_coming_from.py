@@ -13,14 +13,13 @@ import numpy as np
 import pycolmap
 import pytest
 
+import morgs_mi
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.extras.synth.synth_config import SynthConfig
-from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.ply import write_ply
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.playback.visualise import write_png
 from tests.quick import SHORT_FITS
 from tests.scenes import captures as layouts
@@ -36,8 +35,10 @@ FRAMES = 2
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording") / "spheres"
-    synthesize(
-        "spheres", folder, SynthConfig(cameras=CAMERAS, frames=FRAMES, width=320, height=240, spp=8)
+    morgs_mi.synthesize(
+        "spheres",
+        folder,
+        morgs_mi.SynthConfig(cameras=CAMERAS, frames=FRAMES, width=320, height=240, spp=8),
     )
     return load_capture(folder)
 

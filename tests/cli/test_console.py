@@ -2,13 +2,17 @@
 command line.
 """
 
+import io
 import logging
 import time
 import tomllib
+from contextlib import suppress
 
 import pytest
+from rich.console import Console
 from rich.table import Table
 
+from morgs_mi.cli import console
 from morgs_mi.cli.console import (
     LogHandler,
     print_result,
@@ -19,6 +23,7 @@ from morgs_mi.cli.console import (
     sentence_of,
     with_option_names,
 )
+from morgs_mi.cli.streams import rendering
 
 
 def test_progress__prints_a_line_every_30_seconds_without_a_terminal(capsys, monkeypatch):
@@ -35,6 +40,19 @@ def test_progress__prints_a_line_every_30_seconds_without_a_terminal(capsys, mon
         "Fitting frames: 9/12, 2 min elapsed, about 30 s left.",
         "Fitting frames: 12/12, 2 min elapsed, about 0 s left.",
     ]
+
+
+def test_rendering__forecasts_from_the_second_and_third_image(monkeypatch):
+    clock = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: clock)
+    stages = []
+    show = rendering(lambda *state: stages.append(state), 150)
+    for done, seconds in enumerate((60.0, 0.3, 0.1, 0.2, 0.2), start=1):
+        clock += seconds
+        show(done)
+    forecast = "Rendering, 150 images in about 30 s"
+    names = ["Rendering", "Rendering", "Rendering", forecast, forecast, "Rendering"]
+    assert stages == [(name, done, 150) for done, name in enumerate(names)]
 
 
 def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(capsys, monkeypatch):
@@ -129,3 +147,18 @@ def test_sentence_of__has_no_number_and_no_function(error, sentence):
 )
 def test_with_option_names__changes_only_arguments(sentence, expected):
     assert with_option_names(sentence, {"a": "--a", "x.a": "--x-a"}, "clip") == expected
+
+
+def test_progress__ends_a_stage_where_the_next_one_begins(monkeypatch):
+    screen = io.StringIO()
+    monkeypatch.setattr(console, "ERR", Console(file=screen, force_terminal=True, width=100))
+    with suppress(KeyboardInterrupt), progress() as report:
+        report("Balancing cameras", 1, 7)
+        report("First frame, about 42 s", 0, 100)
+        report("First frame", 50, 100)
+        raise KeyboardInterrupt
+    balancing, first_frame = screen.getvalue().split("\n")[-3:-1]
+    assert "Balancing cameras" in balancing
+    assert "7/7" in balancing
+    assert "First frame " in first_frame
+    assert "50/100" in first_frame

@@ -4,9 +4,11 @@ import shutil
 
 import pytest
 
-from morgs_mi.core.files import PROVISIONAL
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.files import PROVISIONAL
 from tests.cli.commands import assert_refused
 from tests.quick import OPTIONS
+from tests.scenes.moving_splats import write_stream
 from tests.scenes.recording import write_recording
 
 
@@ -16,6 +18,24 @@ def test_eval__replaces_no_file_of_the_fit(stream, tmp_path, run):
             run("eval", stream, "--json", tmp_path / name),
             f"{name}: expected a new file, got one that the fit has written",
         )
+
+
+def test_eval__ends_with_what_scores_of_fitted_views_do_not_measure(
+    fitted_clip, tmp_path, run, far_cameras
+):
+    write_stream(tmp_path / "stream.morgs", {"test_view": None})
+    args = ("eval", tmp_path, "--capture", fitted_clip / "capture")
+    assert run(*args)[1].splitlines()[-2] == "These views were fitted."
+    (tmp_path / "report.json").write_text(far_cameras)
+    status, output, _ = run(*args, "--json", tmp_path / "scores.json")
+    assert status == 0
+    assert output.splitlines()[-3] == (
+        "These views were fitted; between the cameras: poor (58 degrees apart); refit with "
+        "`--hold-out cam1` to measure."
+    )
+    assert read_json(tmp_path / "scores.json")["between_cameras"] == "poor (58 degrees apart)"
+    write_stream(tmp_path / "stream.morgs", {"test_view": 0})
+    assert "These views were fitted" not in run(*args)[1]
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import astuple, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,11 +15,9 @@ import pytest
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.bounded import read_json
 from morgs_mi.io.video import VideoReader
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.runs.cluster.chunks import ChunkedRun
-from morgs_mi.runs.cluster.tasks import ChunkConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.quick import OPTIONS
@@ -268,35 +266,3 @@ def test_fit__prints_the_first_problem_and_what_to_expect_of_views_between_the_c
     assert "Frames with a problem (status in report.json): 1 of 2; frame 0: " in output
     assert f"{first['status']}.\n" in output
     assert first["validation"]["sentence"] in " ".join(output.split())
-
-
-@pytest.mark.slow
-def test_fit__fits_chunks_side_by_side_and_names_what_stands_when_interrupted(
-    tmp_path, run, monkeypatch, caplog
-):
-    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
-    short = ChunkConfig(passes=1, epochs=1)
-    monkeypatch.setattr(ChunkConfig.__init__, "__defaults__", astuple(short))
-    clip = write_recording(tmp_path / "clip", 4)
-    out = tmp_path / "out"
-    add = ChunkedRun.add_part
-
-    def add_and_stop(fit, part):
-        add(fit, part)
-        raise KeyboardInterrupt
-
-    args = ["fit", str(clip), str(out), *OPTIONS, "--chunks", "2"]
-    with monkeypatch.context() as patch:
-        patch.setattr(ChunkedRun, "add_part", add_and_stop)
-        status, _, error = run(*args)
-    again = shlex.join(["morgs-mi", *args, "--resume"])
-    assert status == 130
-    assert (
-        error.splitlines()[-1]
-        == f"Interrupted. {out / 'chunks'} holds 2 frames; continue with `{again}`."
-    )
-    status, output, _ = run(*args, "--resume")
-    assert (status, "stream.morgs: 4 frames" in output) == (0, True)
-    assert not any(record.name.startswith("distributed") for record in caplog.records)
-    assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
-    assert_refused(run(*args, "--chunks", 3), "--chunks must be 1 to 2 for 4 frames", "got 3")

@@ -17,9 +17,9 @@ import pytest
 from morgs_mi.cli.main import COMMANDS
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
-from morgs_mi.core.llvm import VARIABLE
 from morgs_mi.io.ply import write_ply
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.platform.llvm import VARIABLE
 from tests.quick import OPTIONS, SHORT_FITS
 from tests.scenes import changing_splats, noise_capture
 

@@ -12,7 +12,7 @@ import pytest
 from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from tests.cli.commands import assert_one_sentence, assert_refused
-from tests.core.test_files import tree
+from tests.platform.test_files import tree
 from tests.quick import OPTIONS
 from tests.scenes.noise_capture import rig
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import morgs_mi
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.extras.synth.synth_config import SynthConfig
-from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
 from tests.quick import SHORT_FITS
@@ -46,10 +45,10 @@ def recordings(tmp_path_factory):
     clips alone.
     """
     folder = tmp_path_factory.mktemp("recordings")
-    synthesize(
+    morgs_mi.synthesize(
         "spheres",
         folder / "CAPTURE",
-        SynthConfig(cameras=7, frames=6, width=240, height=180, spp=8),
+        morgs_mi.SynthConfig(cameras=7, frames=6, width=240, height=180, spp=8),
     )
     (folder / "FOLDER").mkdir()
     capture = load_capture(folder / "CAPTURE")

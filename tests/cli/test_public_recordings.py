@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.core.bounded import read_json
-from morgs_mi.extras.synth.synth_config import SynthConfig
-from morgs_mi.extras.synth.synthesize import synthesize
+import morgs_mi
+from morgs_mi.platform.bounded import read_json
 
 PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
 FRAMES = 3
@@ -23,10 +22,12 @@ def stand_in(path, width, height, number):
     """Write videos with camera numbers in this format, and `poses_bounds.npy`, as these recordings
     have them.
     """
-    synthesize(
+    morgs_mi.synthesize(
         "random",
         path,
-        SynthConfig(cameras=8, frames=FRAMES, width=width, height=height, seed=3, lossless=False),
+        morgs_mi.SynthConfig(
+            cameras=8, frames=FRAMES, width=width, height=height, seed=3, lossless=False
+        ),
     )
     for extra in ("sparse", "truth"):
         shutil.rmtree(path / extra)

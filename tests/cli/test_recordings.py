@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 
 FOLDER = os.environ.get("MORGS_MI_RECORDINGS")
 CAPTURES = sorted(path for path in Path(FOLDER).iterdir() if path.is_dir()) if FOLDER else []

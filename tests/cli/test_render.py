@@ -22,11 +22,6 @@ from tests.scenes.noise_capture import rig
             ["--camera", "0", "--channels", "confidence"],
             ("channel 'confidence' requires Gaussians with `logit_confidence`",),
         ),
-        (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),
-        (
-            ["--camera", "0", "--at", "1"],
-            ("--at selects frames of an inserted scene", "add --insert FILE"),
-        ),
     ],
 )
 def test_render__rejects_bad_input_in_one_sentence(stream, tmp_path, run, args, parts):
@@ -42,15 +37,25 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path, run):
     assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
 
 
-@pytest.mark.slow
-def test_render__inserts_a_scene_into_some_frames(stream, tmp_path, run):
-    (tmp_path / "ball.py").write_text(
-        'def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n'
-    )
-    args = ("--camera", 0, "--insert", tmp_path / "ball.py", "--at", 1, "--samples", 1)
-    assert run("render", stream, tmp_path / "exr", *args)[0] == 0
-    assert [path.name for path in (tmp_path / "exr").iterdir()] == ["0001.exr"]
-    assert {"R", "A", "depth.Y"} <= read_exr(tmp_path / "exr" / "0001.exr").keys()
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("render", "--path", "between", "--width", 16),
+        ("export", "video", "--width", 16, "--least-seconds", 0),
+        ("export", "web"),
+    ],
+    ids=lambda args: " ".join(args[:2]),
+)
+def test_outputs_between_the_cameras__say_once_what_the_fit_expects(
+    stream, tmp_path, run, far_cameras, args
+):
+    command, *options = args
+    kind = [options.pop(0)] if command == "export" else []
+    assert "between the cameras" not in run(command, *kind, stream, *options)[1]
+    (tmp_path / "report.json").write_text(far_cameras)
+    status, output, _ = run(command, *kind, stream, *options)
+    assert status == 0
+    assert output.count("Views between the cameras: poor (58 degrees apart).") == 1
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "exr"])

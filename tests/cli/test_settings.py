@@ -4,6 +4,7 @@ import re
 import tomllib
 from dataclasses import asdict, fields
 from functools import reduce
+from pathlib import Path
 from typing import get_type_hints
 
 import pytest
@@ -11,9 +12,8 @@ import pytest
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.main import main
 from morgs_mi.cli.settings import SETTINGS, Reading
-from morgs_mi.core.config import apply_values, config_toml
-from morgs_mi.extras.live.live_config import LIVE_STREAM
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.config import apply_values, config_toml
 
 
 def printed_config(run, *args):
@@ -85,6 +85,18 @@ def test_fit__prints_a_config_that_it_reads_back(tmp_path, run, args):
         assert {key for key in values if values[key] != default[key]} == set(SETTINGS.values())
 
 
+@pytest.mark.parametrize(("name", "epochs", "interval"), [("meet_room", 15, 3), ("n3dv", 8, 10)])
+def test_reproduction_page__settings_are_accepted(tmp_path, run, name, epochs, interval):
+    page = Path(__file__).parents[2] / "docs/experiments/reproduction.md"
+    pattern = rf"<!-- settings: {name}.toml -->\n```toml\n(.*?)```"
+    (text,) = re.findall(pattern, page.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "a.toml").write_text(text)
+    config = printed_config(run, "--preset", "paper", "--config", tmp_path / "a.toml")
+    assert (config.fit.epochs, config.motion.mask_interval) == (epochs, interval)
+    assert len(config.motion.key_views) == 4
+    assert not config.motion.two_gates
+
+
 def flattened(values, prefix=""):
     pairs = [
         flattened(value, f"{prefix}{name}.")
@@ -95,8 +107,8 @@ def flattened(values, prefix=""):
     return {key: value for part in pairs for key, value in part.items()}
 
 
-@pytest.mark.parametrize(("command", "config"), [("fit", StreamConfig()), ("live", LIVE_STREAM)])
-def test_help__shows_the_defaults_of_the_options(command, config, capsys):
+def check_help(command, config, capsys):
+    """Assert that the help of a command has the defaults of a config."""
     with pytest.raises(SystemExit):
         main([command, "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
@@ -106,7 +118,11 @@ def test_help__shows_the_defaults_of_the_options(command, config, capsys):
             "" if default is None or default is False else rf" (?:(?!--).)*\(default: {default}\)"
         )
         assert re.search(rf"--{option.replace('_', '-')}{shown}", text), option
-    assert command == "live" or "None)" not in text
+    return text
+
+
+def test_help__shows_the_defaults_of_the_options(capsys):
+    assert "None)" not in check_help("fit", StreamConfig(), capsys)
 
 
 def test_Reading__has_the_fields_of_the_config():

@@ -15,7 +15,7 @@ from numpy.testing import assert_array_equal
 from morgs_mi.codec.container import StreamWriter, header_fields, header_json, load_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.png import PngImage, jpeg_bytes, png_bytes
+from morgs_mi.platform.png import PngImage, jpeg_bytes, png_bytes
 from morgs_mi.render.rasterize import rasterize
 from tests.scenes.coded_clip import CAMERAS, cloud
 

@@ -15,7 +15,7 @@ import pytest
 from morgs_mi.codec.container import VERSION
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 
 STREAMS = Path(__file__).parent / "streams"
 PROMISES = (Path(__file__).parents[2] / "docs" / "promises.md").read_text(encoding="utf-8")

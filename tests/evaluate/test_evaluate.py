@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,14 +15,16 @@ from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
+from morgs_mi.evaluate.comparison import _nearest_views
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.metrics import psnr, psnr_mu
 from morgs_mi.evaluate.tables import evaluation_summary
-from morgs_mi.extras.networks.lpips import Lpips
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
+from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.moving_splats import (
     CAMERAS,
     EXACT,
@@ -162,6 +165,24 @@ def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(fitt
     assert f"{result.scores.psnr_matched:.2f} dB after the gain and bias" in " ".join(
         evaluation_summary(result)
     )
+
+
+def test_evaluate_stream__copies_the_nearest_training_view_in_place_of_a_held_out_one(
+    fitted_clip, tmp_path
+):
+    result = evaluate_stream(fitted_clip)
+    frames = load_capture(fitted_clip / "capture").frames()
+    floors = [psnr(frame.images[1], frame.images[0]) for frame in frames]
+    assert [row.scores.psnr_nearest for row in result.frames] == pytest.approx(floors)
+    write_stream(tmp_path / "s.morgs", {"test_view": None})
+    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    assert np.isnan(result.scores.psnr_nearest)
+
+
+def test_nearest_views__have_the_least_angle_from_the_scene():
+    cameras = look_at_cameras(arc(np.deg2rad((0, 40, 50, 90)), 4), 40)
+    rig = SimpleNamespace(points=np.zeros((1, 3)), train_views=(0, 1, 3), test_views=(2,))
+    assert _nearest_views(rig, cameras) == {2: 1}
 
 
 def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted_clip, tmp_path):

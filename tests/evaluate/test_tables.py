@@ -35,6 +35,8 @@ def test_evaluation_tables__fit_eighty_columns(result):
         figure(v, 2)
         for v in (result.scores.delta_e, result.scores.delta_e_moving, result.scores.delta_e_still)
     ]
+    nearest = figure(result.scores.psnr_nearest, 2)
+    assert rows["PSNR, nearest image copied"] == [nearest, "-", "-"]
     assert "LPIPS" not in rows, "no network was given"
     assert any(line.endswith(figure(result.variation.input, 3)) for line in lines)
 

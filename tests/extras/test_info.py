@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from morgs_mi.extras.calibration import command as info
+from morgs_mi.extras.calibration.checks.rig_check import RigCheck
 from morgs_mi.extras.calibration.timing import TimeOffsets
+from morgs_mi.fit.forecast import Forecast
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
 from tests.cli.commands import assert_refused
@@ -57,6 +59,16 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture
     assert "cam2 does not fit: its images are upside down" in out
 
 
+def test_info__says_in_one_sentence_that_a_rig_is_too_wide_to_match(capture, run, monkeypatch):
+    wide = Forecast(4, 58.0, 0.92, 60.0)
+    monkeypatch.setattr(info, "forecast", lambda *_: wide)
+    assert "Reprojection check" in run("info", capture)[1]
+    monkeypatch.setattr(RigCheck, "unmatched", True)
+    out = run("info", capture)[1]
+    assert out.startswith(wide.unmatched_sentence)
+    assert "Reprojection check" not in out
+
+
 def test_info__names_black_first_images(capture, run):
     for image in capture.glob("cam*/0000.png"):
         write_png(image, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
@@ -76,7 +88,7 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture, tmp_path, ru
     assert out.startswith("Views between the cameras will be good: 5 cameras, 7 degrees apart")
     assert "\nReprojection check: median 0.0" in out
     assert "in 15 pairs; the poses fit the images." in out
-    assert cv2.imread(str(plot)).shape == (760, 1440, 3)
+    assert cv2.imread(str(plot)).shape == (910, 1440, 3)
     assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == times
     refused = run("info", path, "--plot", tmp_path / "rig.gif")
     assert_refused(refused, "the suffix of a plot must be .png, .jpg, .svg or .pdf, got '.gif'")

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morgs_mi.core.view import View
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, DetailConfig, FitConfig
-from morgs_mi.fit.view import View
 from tests.scenes.ball import bytes_of, images_of, opaque_ball, views
 
 PIXELS = 64 * 48

@@ -14,6 +14,7 @@ from morgs_mi.fit.density import (
 )
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.error_per_gaussian import densification_scores
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.testing import assert_close
@@ -169,12 +170,14 @@ def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():
     sh = np.full((6, 1, 3), 0.5, np.float32)
     sh[4] = -1.0
     wrong = dataclasses.replace(truth, sh_coeffs=sh)
-    scores = densification_scores(wrong, [ActiveView(camera)], [Target(image)])
+    scores = densification_scores(wrong, [ObservedView.of(ActiveView(camera), Target(image))])
     assert scores.argmax() == 4
     assert scores[[0, 1, 2]].max() < 0.01 * scores[4]
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
     assert (
-        densification_scores(wrong, [ActiveView(camera)], [Target(image, hidden)]).max()
+        densification_scores(
+            wrong, [ObservedView.of(ActiveView(camera), Target(image, hidden))]
+        ).max()
         < 0.01 * scores[4]
     )

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.rig import mean_views
+from morgs_mi.core.view import View
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.detail import count_details
 from morgs_mi.fit.fit_config import DetailConfig, FitConfig
-from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 
 CONFIG = DetailConfig(per_detail=1.0, least_gaussians=10, most_gaussians=10**6)

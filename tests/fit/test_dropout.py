@@ -9,10 +9,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from morgs_mi import RenderConfig
+from morgs_mi.core.view import View
 from morgs_mi.fit.first_frame import adapted_to_images, dropped
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.fit.view import View
 from tests.scenes.ball import bytes_of, images_of, opaque_ball, problem
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.derivatives import backward, gradient

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
-from morgs_mi.core.progress import Progress
+from morgs_mi.core.view import View
 from morgs_mi.fit.first_frame import density_rounds, fit_confidence, fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates
-from morgs_mi.fit.view import View, rendered
+from morgs_mi.fit.view import rendered
 from morgs_mi.method.objective import ObjectiveConfig
-from morgs_mi.render.active_view import ActiveView
+from morgs_mi.platform.progress import Progress
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.testing import assert_close
 from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem, views
 
@@ -39,15 +40,16 @@ def images():
 def drawn(monkeypatch):
     """A list to which every step of a fit adds the Gaussians and the width that it renders."""
     steps = []
-    render = ActiveView.render
 
-    def spy(view, gaussians, *channels, **more):
+    def spy(gaussians, view, *channels, **more):
         # Rounds of density control render without gradients.
         if dr.grad_enabled(gaussians.sh_coeffs):
             steps.append((gaussians.detached(), view.camera.width))
-        return render(view, gaussians, *channels, **more)
+        return render_view(gaussians, view, *channels, **more)
 
-    monkeypatch.setattr(ActiveView, "render", spy)
+    monkeypatch.setattr("morgs_mi.fit.first_frame.render_view", spy)
+    # A recording renders in its own way, with the same result (see test_frozen_step).
+    monkeypatch.setattr("morgs_mi.fit.first_frame.is_recordable", lambda *_: False)
     return steps
 
 
@@ -89,16 +91,33 @@ def test_fit_first_frame__reports_its_steps(images):
 
 
 def test_fit_first_frame__skips_steps_to_keep_a_limit_of_the_clock(images, monkeypatch):
-    moments = iter(np.arange(0, 1e6, 2.0))  # 20 steps take 2 s
-    monkeypatch.setattr("morgs_mi.fit.first_frame.time.perf_counter", lambda: next(moments))
+    clock = 0.0
+    monkeypatch.setattr("morgs_mi.fit.first_frame.time.perf_counter", lambda: clock)
     config = dataclasses.replace(CONFIG, first_frame_steps=2000)
     done = []
-    report = Progress(lambda stage, step, total: done.append(step))
-    result = fit(images, ball(80), config, progress=report, limit=60.0)
-    assert next(moments) < 1.3 * 60
+
+    def report(stage, seconds, total):
+        nonlocal clock
+        clock += 0.1
+        assert total == 60.0 or seconds > 60.0
+        done.append(seconds)
+
+    result = fit(images, ball(80), config, progress=Progress(report), limit=60.0)
+    assert clock < 1.3 * 60
     assert 200 < result.steps < 700
     assert done == sorted(done)
-    assert done[-1] > 1990
+    assert done[-1] >= 60.0
+
+
+def test_fit_first_frame__reports_steps_in_proportion_to_their_time(images):
+    """From the last round on, the images have twice the size in both directions."""
+    done = []
+    report = Progress(lambda stage, step, total: done.append(step))
+    config = dataclasses.replace(CONFIG, density=DensityConfig(rounds=2), first_frame_steps=60)
+    fit(images, ball(80), config, progress=report)
+    early, late = np.diff(done)[[0, -1]]
+    assert late == pytest.approx(2 * early)
+    assert done[-1] == pytest.approx(60)
 
 
 def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
@@ -183,7 +202,7 @@ def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(
     images, drawn, monkeypatch
 ):
     monkeypatch.setattr("morgs_mi.fit.view.COARSE_WIDTH", 32)
-    monkeypatch.setattr("morgs_mi.fit.view.MIN_SIDE", 24)
+    monkeypatch.setattr("morgs_mi.core.view.MIN_SIDE", 24)
     config = dataclasses.replace(CONFIG, first_frame_steps=20, density=DensityConfig(rounds=3))
     fit(images, ball(60), config)
     fit(images, ball(60), CONFIG)

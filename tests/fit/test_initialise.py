@@ -7,16 +7,17 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
+from morgs_mi.core.view import View
 from morgs_mi.fit.initialise import (
     MIN_POINTS,
     _in_light,
+    border_color,
     fill_points,
     in_empty_space,
     initial_points,
     seed_points,
     unseen_points,
 )
-from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 
 
@@ -70,7 +71,7 @@ def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(cou
 @pytest.mark.parametrize("count", [0, 40, 2000])
 def test_initial_points__leave_the_space_before_near_planes_empty(count):
     (points, colors), views = few_points()
-    views = [view._replace(camera=replace(view.camera, near=5.0)) for view in views]
+    views = [replace(view, camera=replace(view.camera, near=5.0)) for view in views]
     points = np.concatenate([points, points - (0, 0, 4)])
     point_cloud = np.resize(points, (count, 3)), np.resize(colors, (count, 3))
     chosen, _ = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
@@ -134,6 +135,50 @@ def test_seed_points__lie_on_valid_pixels_in_their_colours():
         columns, rows = pixels.astype(int).T
         shown[rows_of_points] |= mask[rows, columns]
     assert shown.all()
+
+
+def red_ball_views(background):
+    """Return eight views around a red ball of radius 1 at the origin, over a plain background."""
+    cameras = look_at_cameras(arc(np.arange(8) * np.pi / 4, 5, y=-1))
+    images = [np.full((c.height, c.width, 3), background, np.float32) for c in cameras]
+    for camera, image in zip(cameras, images, strict=True):
+        rows, columns = np.indices(image.shape[:2])
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2) + 0.5
+        rays = camera.unproject(pixels, np.ones(len(pixels))) - camera.position
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        distance = np.linalg.norm(np.cross(rays, camera.position), axis=1)
+        image[(distance < 1).reshape(rows.shape)] = 0.8, 0.1, 0.1
+    return [View(camera, image) for camera, image in zip(cameras, images, strict=True)]
+
+
+def test_seed_points__lie_where_most_views_show_their_colour():
+    background = (0.9, 0.9, 0.9)
+    views = red_ball_views(background)
+    points, colors = seed_points(views, 400, np.random.default_rng(0), background)
+    assert_allclose(colors, np.tile([0.8, 0.1, 0.1], (400, 1)), atol=1e-6)
+    assert np.quantile(np.linalg.norm(points, axis=1), 0.95) < 1.2
+    _, colors = seed_points(views, 400, np.random.default_rng(0))
+    is_background = np.isclose(colors, 0.9).all(axis=1)
+    assert 0.5 < is_background.mean() < 0.95, "without a background, all pixels have points"
+
+
+def test_border_color__is_what_borders_have_in_common():
+    views = red_ball_views((0.9, 0.8, 0.7))
+    assert_allclose(border_color(views), (0.9, 0.8, 0.7), atol=1e-6)
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(view, image=view.image + rng.normal(0, 0.1, view.image.shape)) for view in views
+    ]
+    assert border_color(noisy) is None
+    coloured = red_ball_views((0.9, 0.8, 0.7))
+    for k, view in enumerate(coloured):
+        view.image[:] *= 1 - 0.1 * k
+    assert border_color(coloured) is None
+    masks = [np.zeros(view.image.shape[:2], bool) for view in views]
+    for mask in masks:
+        mask[20:30, 20:30] = True
+    masked = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
+    assert border_color(masked) is None
 
 
 def test_seen_points__leaves_out_points_behind_and_beside_the_camera():

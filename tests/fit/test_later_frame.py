@@ -2,19 +2,21 @@
 
 from dataclasses import replace
 
+import drjit as dr
 import numpy as np
 import pytest
 
 from morgs_mi import Gaussians, RenderConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
-from morgs_mi.loop.stream_config import StreamConfig, apply_preset
+from morgs_mi.method import objective
 from morgs_mi.method.active_set import full_active_set
+from morgs_mi.method.method_registry import Registry
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.objective import ObjectiveConfig
-from morgs_mi.method.ssim import Target
+from morgs_mi.method.objective import ObjectiveConfig, loss_term
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
+from tests.scenes.views import observed
 
 RENDER = RenderConfig()
 EXTENT = 3.0
@@ -23,8 +25,7 @@ PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=Fa
 
 def fit(previous, images, config, motion=PLAIN):
     active = full_active_set(previous, dict(enumerate(views())), RENDER)
-    targets = {view: Target(image) for view, image in enumerate(images)}
-    problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
+    problem = FrameProblem(previous, active, observed(active.views, images), None, EXTENT)
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 
@@ -78,53 +79,48 @@ def test_fit_later_frame__adds_none_when_no_step_is_left_to_fit_them():
     assert np.array_equal(fitted.source, np.arange(200))
 
 
-def shifted(shift):
-    """Return a ball, the ball after a shift, and the shift."""
-    ball = opaque_ball()
-    by = np.array(shift, np.float32)
-    return ball, replace(ball, means=np.asarray(ball.means) + by), by
-
-
-@pytest.mark.slow
-def test_fit_later_frame__rigid_neighbours_move_alike():
-    start, truth, shift = shifted((0.06, -0.03, 0.02))
-    usual = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
-    preset = apply_preset(StreamConfig(fit=usual), "rigidity").fit
-    results = [fit(start, images_of(truth), config) for config in (usual, preset)]
-    free, rigid = (
-        np.linalg.norm(np.asarray(r.gaussians.motion) - shift, axis=1).mean() for r in results
-    )
-    assert rigid < 0.5 * free
-    assert results[1].losses.keys() == {"recon", "rigid", "rotation", "isometry"}
-    for name in ("log_scales", "logit_opacities", "sh_coeffs"):
-        assert np.array_equal(getattr(results[1].gaussians, name), getattr(start, name)), (
-            "the preset moves alone"
-        )
-
-
-def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents():
+def test_fit_later_frame__terms_compare_with_the_previous_frame(monkeypatch):
     """With births, there are more Gaussians after the round of density control than before it."""
+    monkeypatch.setattr(
+        objective, "LOSS_TERMS", Registry("ObjectiveConfig()", "terms", ObjectiveConfig)
+    )
+    compared = []
+
+    @loss_term("still")
+    def still_loss(prediction, observations, config):
+        previous = prediction.previous
+        if not any(previous is other for other in compared):
+            compared.append(previous)
+        return dr.mean(dr.abs(prediction.gaussians.means - previous.means), axis=None)
+
     truth = opaque_ball()
     start = truth.select(np.flatnonzero(truth.numpy()["means"][:, 0] < 0.3))
-    config = FitConfig(
-        sh_degree=0,
-        epochs=4,
-        objective=ObjectiveConfig(rigid_weight=1.0),
-        density=DensityConfig(births=0.3, min_error=0),
+    density = DensityConfig(births=0.3, min_error=0)
+    config = FitConfig(sh_degree=0, epochs=4, density=density)
+    free, held = (
+        fit(start, images_of(truth), replace(config, objective=ObjectiveConfig(terms=terms)))
+        for terms in ((), ("still:100",))
     )
-    result = fit(start, images_of(truth), config)
-    assert len(result.gaussians) > len(start)
-    assert np.isfinite(result.losses["rigid"])
-    alone = fit(truth.select(np.array([3])), images_of(truth), config)
-    assert alone.losses.keys() == {"recon"}
+    old_means, new_means = (np.asarray(previous.means) for previous in compared)
+    assert np.array_equal(old_means, start.means)
+    assert len(new_means) == len(held.gaussians) > len(old_means)
+    survivors = held.source[held.source >= 0]
+    assert np.array_equal(new_means[: len(survivors)], old_means[survivors])
+    assert held.losses.keys() == {"recon", "still"}
+    moves, free_moves = (
+        np.abs(np.asarray(result.gaussians.motion)[result.source >= 0]).mean()
+        for result in (held, free)
+    )
+    assert moves < 0.5 * free_moves
 
 
 def test_initial_motion__continues_with_constant_velocity():
     previous_gaussians = replace(opaque_ball(), motion=np.full((400, 3), 0.1))
     rng = np.random.default_rng(0)
     active = full_active_set(previous_gaussians, dict(enumerate(views())), RENDER)
-    assert initial_motion(previous_gaussians, active, {}, {}, PLAIN, rng) is None
+    active_views = observed(active.views, images_of(opaque_ball()))
+    assert initial_motion(previous_gaussians, active, active_views, {}, PLAIN, rng) is None
     start = initial_motion(
-        previous_gaussians, active, {}, {}, replace(PLAIN, constant_velocity=True), rng
+        previous_gaussians, active, active_views, {}, replace(PLAIN, constant_velocity=True), rng
     )
     assert np.array_equal(start.displacement, np.full((400, 3), 0.1, np.float32))

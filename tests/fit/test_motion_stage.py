@@ -15,7 +15,7 @@ from morgs_mi.method.motion_model import (
     sparse_product,
 )
 from morgs_mi.method.motion_start import MotionStart
-from tests.scenes.ball import opaque_ball
+from tests.scenes.ball import opaque_ball, views
 from tests.scenes.shifted_ball import FIT, PLAIN, SHIFT, fit_shifted, motion_error, psnr_of
 
 
@@ -51,7 +51,7 @@ def test_fit_later_frame__finds_the_motion_that_gaussians_share():
     shared = fit()
     assert motion_error(shared) < 0.7 * motion_error(free)
     assert psnr_of(shared) > psnr_of(free)
-    assert shared.epochs == free.epochs == FIT.epochs
+    assert shared.steps == free.steps == FIT.epochs * len(views())
 
 
 def test_fit_later_frame__continues_from_a_start():
@@ -62,7 +62,7 @@ def test_fit_later_frame__continues_from_a_start():
 
 def test_fit_later_frame__fits_the_model_alone_in_a_single_epoch():
     result = fit(replace(FIT, epochs=1))
-    assert result.epochs == 1
+    assert result.steps == len(views())
     assert result.losses["recon"] > 0
     assert result.losses["length"] > 0
     assert not np.asarray(result.gaussians.offset).any()
@@ -70,7 +70,7 @@ def test_fit_later_frame__fits_the_model_alone_in_a_single_epoch():
 
 def test_fit_later_frame__shares_its_epochs_with_the_model():
     some, all_of_it = (fit(replace(FIT, epochs=4), share=share) for share in (0.25, 1.0))
-    assert some.epochs == all_of_it.epochs == 4
+    assert some.steps == all_of_it.steps == 4 * len(views())
     assert (
         np.abs(np.asarray(some.gaussians.log_scales) - np.asarray(opaque_ball().log_scales)).max()
         > 0

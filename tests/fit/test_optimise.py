@@ -125,8 +125,8 @@ def test_replace_parameter__keeps_moments():
             replace_parameter(
                 optimizer,
                 "x",
-                np.pad(value, [(0, 0), (0, 2)]),
-                lambda m: np.pad(m, [(0, 0), (0, 2)]),
+                mi.TensorXf(np.pad(value, [(0, 0), (0, 2)])),
+                lambda m: mi.TensorXf(np.pad(m, [(0, 0), (0, 2)])),
             )
         optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * 4, 4))
         ends.append(np.asarray(values_of(optimizer)["x"]))

@@ -1,15 +1,18 @@
 """The problem of a first frame, and the views that it consists of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import RenderConfig
 from morgs_mi.core.rig import scene_extent
+from morgs_mi.core.view import View
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.fit.view import View, mean_psnr, rendered, withheld_blocks
+from morgs_mi.fit.view import mean_psnr, rendered, withheld_blocks
 from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views
 from tests.scenes.cameras import look_at_cameras
 
@@ -68,7 +71,7 @@ def test_mean_psnr__does_not_count_masked_pixels():
 def test_mean_psnr__leaves_out_views_without_valid_pixels():
     images = bytes_of(images_of(opaque_ball()))
     first, *others = problem(images).views
-    none = first._replace(mask=np.zeros((48, 64), bool))
+    none = replace(first, mask=np.zeros((48, 64), bool))
     scores = [mean_psnr(ball(80), some, RenderConfig()) for some in (others, (none, *others))]
     assert scores[0] == scores[1]
     assert np.isnan(mean_psnr(ball(80), [none], RenderConfig()))
@@ -80,11 +83,11 @@ def test_mean_psnr__leaves_out_views_without_valid_pixels():
 )
 def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(width, size):
     # A reduced image has 32 pixels at least on each side.
-    camera, image, mask = large_view().reduced(width)
-    assert (camera.width, camera.height) == size == image.shape[1::-1]
-    assert mask is None
-    assert image.mean() == pytest.approx(127.5, abs=1)
-    assert_allclose(camera.K, np.diag([size[0] / 160, size[1] / 120, 1]) @ LARGE.K)
+    view = large_view().reduced(width)
+    assert view.camera.size == size == view.image.shape[1::-1]
+    assert view.mask is None
+    assert view.image.mean() == pytest.approx(127.5, abs=1)
+    assert_allclose(view.camera.K, np.diag([size[0] / 160, size[1] / 120, 1]) @ LARGE.K)
 
 
 def test_view__reduced_pixels_are_valid_if_all_that_they_cover_are():

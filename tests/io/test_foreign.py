@@ -2,7 +2,6 @@
 
 import pytest
 
-from morgs_mi.extras.imports.import_frames import import_frames
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.streams import open_stream
 
@@ -19,7 +18,7 @@ FILES = {
 @pytest.mark.parametrize("name", FILES)
 def test_refuse_foreign__names_the_remedy_at_every_door(tmp_path, name):
     (tmp_path / name).write_bytes(b"ply\nformat ascii 1.0\n" if name == "g.splat" else b"")
-    for door in (open_stream, read_splats, lambda path: import_frames([path], tmp_path / "out")):
+    for door in (open_stream, read_splats):
         with pytest.raises(
             ValueError, match=rf"{name}: expected Gaussians as \.ply.*{FILES[name]}"
         ):

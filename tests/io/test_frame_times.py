@@ -1,14 +1,12 @@
 """Frames of clips that are cut by an edit list, and rates that headers round."""
 
 from pathlib import Path
-from threading import Event
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from morgs_mi.extras.live.sources import ClipClock, play
 from morgs_mi.io.frame_times import true_rate
 from morgs_mi.io.video import VideoReader
 from tests.scenes.captures import write_timed_video
@@ -53,7 +51,7 @@ def test_video_reader__has_the_shown_frames_of_hevc_with_sound(name):
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("file", ["a.mp4 mpeg4", "a.mov libx264"])
 def test_video_reader__has_the_frames_that_the_edit_list_shows(tmp_path, file, part):
-    """With frames that refer to later ones in H.264; live plays the same frames."""
+    """With frames that refer to later ones in H.264."""
     name, codec = file.split()
     parts, frames = PARTS[part]
     write_timed_video(tmp_path / name, clip(), range(0, 50 * COUNT, 50), codec)
@@ -66,17 +64,6 @@ def test_video_reader__has_the_frames_that_the_edit_list_shows(tmp_path, file, p
         assert_allclose(np.diff(reader.times), 1 / FPS, atol=1e-3)
     last = len(frames) - 1
     assert [number(image) for image in reader.pick([last])] == [frames[-1]]  # type: ignore[arg-type]
-
-
-def test_play__shows_the_frames_of_the_reader(tmp_path):
-    write_timed_video(tmp_path / "a.mp4", clip(20), range(0, 200, 10), "libx264")
-    show_parts(tmp_path / "a.mp4", [(0.05, 0.08)])
-    played = [number(image) for image in play(tmp_path / "a.mp4", ClipClock(), Event())]
-    assert (
-        played
-        == [number(image) for image in VideoReader.open(tmp_path / "a.mp4").frames()]
-        == list(range(5, 13))
-    )
 
 
 def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_path):

@@ -5,13 +5,15 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from morgs_mi.core.view import View
 from morgs_mi.fit.fit_config import LearningRates
-from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.fit.view import mean_psnr
 from morgs_mi.loop.first_frame import fit_gaussians
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.quick import quick
 from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, views
+from tests.scenes.textured import distance_to_planes
 
 QUICK = quick(num_gaussians=200, first_frame_steps=40, epochs=3, dropout=0.0)
 POINTS = ball(200).numpy()["means"], np.full((200, 3), 0.5)
@@ -69,3 +71,10 @@ def test_push__seeds_points_where_no_camera_sees_the_given_ones(caplog):
     fit_gaussians(views(), images(), means + np.float32([50, 0, 0]), colors, QUICK)
     assert [record.getMessage() for record in caplog.records] == warnings
     assert warnings[0].startswith("frame 0: the cameras see 0 % of the 200 points")
+
+
+def test_fit_gaussians__starts_from_points_of_matched_images(textured_capture):
+    images = next(textured_capture.frames()).images
+    fitted = fit_gaussians(textured_capture.cameras, images, config=quick())
+    assert fitted.report.status == "ok", "no random points"
+    assert distance_to_planes(fitted.gaussians.numpy()["means"]).mean() < 0.1

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from morgs_mi.core import color_space
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, encode_light
+from morgs_mi.core.view import View
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.input_images import copied_images
 from morgs_mi.loop.observation import ImageHistory, observe_frame, prepare
@@ -21,7 +22,7 @@ GREY = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
 
 
 def copied(image):
-    return copied_images([CAMERA], [image], 0)[0]
+    return copied_images([View(CAMERA)], [image], 0)[0]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_copied_images__refuses_others(image, message):
         copied(image)
 
 
-RIG = [replace(CAMERA, name=name) for name in "ab"]
+RIG = [View(replace(CAMERA, name=name)) for name in "ab"]
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ from typing import get_args
 
 import pytest
 
-from morgs_mi.core.config import apply_values
 from morgs_mi.fit.fit_config import FitConfig, LearningRates
 from morgs_mi.loop.stream_config import PRESETS, PresetName, StreamConfig, apply_preset
 from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.platform.config import apply_values
 from morgs_mi.render.render_config import RenderConfig
 
 

@@ -13,16 +13,15 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.method.active_set import ActiveSet, ActiveSetConfig, find_active_set, full_active_set
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.ssim import Target
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
+from tests.scenes.views import observed
 
 RENDER = RenderConfig()
 CONFIG = ActiveSetConfig()
 EXTENT = 3.0
 V = 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
-CHANNELS = {view: ("color",) for view in range(V)}
 HIDDEN = 300  # the wall's Gaussians come first
 
 
@@ -48,8 +47,7 @@ def images_of(gaussians):
 
 
 def fit(previous, active, images, config):
-    targets = {view: Target(image) for view, image in enumerate(images)}
-    problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
+    problem = FrameProblem(previous, active, observed(active.views, images), None, EXTENT)
     return fit_later_frame(problem, config, PLAIN, np.random.default_rng(0))
 
 
@@ -69,7 +67,8 @@ def changes(previous, current):
 
 
 def found(gaussians, changed, config=CONFIG):
-    return find_active_set(gaussians, cameras(), changed, CHANNELS, RENDER, config)
+    active = find_active_set(gaussians, cameras(), changed, RENDER, config)
+    return active.with_static(gaussians, ("color",))
 
 
 def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, current):
@@ -89,7 +88,7 @@ def test_find_active_set__is_empty_without_changes(previous):
     assert not active.views
     assert active.fractions == {"gaussians": 0, "views": 0, "pixels": 0}
     fitted = fit(previous, active, [], FitConfig(sh_degree=0))
-    assert fitted.epochs == 0
+    assert fitted.steps == 0
     assert np.array_equal(fitted.gaussians.means, previous.means)
     assert not np.asarray(fitted.gaussians.motion).any()
 
@@ -178,17 +177,6 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(previous, curr
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
         values = np.asarray(getattr(fitted.gaussians, attribute))[where]
         assert np.array_equal(values, np.asarray(getattr(previous, attribute))[still]), attribute
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])
-def test_fit_later_frame__ends_early_once_the_loss_stops_falling(previous, density):
-    """With and without density control; a tolerance of 0 switches it off."""
-    whole = full_active_set(previous, cameras(), RENDER)
-    images = images_of(previous)
-    config = FitConfig(sh_degree=0, epochs=12, density=density)
-    assert fit(previous, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
-    assert fit(previous, whole, images, config).epochs < 12
 
 
 def test_merge__has_the_order_of_the_previous_frame_and_births_last():

@@ -37,18 +37,17 @@ def test_motion_mask__finds_a_moving_disc(method, shift):
 
 def test_motion_mask__passes_its_config_to_threshold_and_refiner():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
-    method = "superpixels+grabcut"
+    method = "grabcut"
     observation = observe_key_views({7: FramePair(image, previous)}, "dis", method)[7]
     motion = observation.motion
     reliable = observation.reliable
-    for config in (CONFIG, MaskConfig(floor=20), MaskConfig(superpixel_share=0.2)):
+    for config in (CONFIG, MaskConfig(floor=20), MaskConfig(working_width=40)):
         flow = flow_mask(motion, reliable, config)
         expected = MASK_REFINERS.make(method, config)(image, flow)
         mask = motion_mask(image, motion, reliable, method, config)
         assert_array_equal(mask, expected)
         assert np.array_equal(mask, observation.mask) == (config is CONFIG)
-    with_grabcut = motion_mask(image, motion, reliable, "grabcut", CONFIG)
-    assert not (flow_mask(motion, reliable, CONFIG) & ~with_grabcut).any()
+    assert not (flow_mask(motion, reliable, CONFIG) & ~observation.mask).any()
     assert observed(image, previous).mask is None
 
 

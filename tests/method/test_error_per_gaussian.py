@@ -8,12 +8,15 @@ import pytest
 from morgs_mi import RenderConfig
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.error_per_gaussian import ErrorPerGaussian, densification_scores
+from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
+from tests.scenes.views import make_active_view
 
 N = 300
 
@@ -37,16 +40,17 @@ def scene():
         make_active_view(cameras[1], Region.of(part), static, ("color",), RenderConfig()),
     ]
     images = [cv2.GaussianBlur(rng.random((60, 80, 3), np.float32), (0, 0), 2) for _ in views]
-    return wall, views, [Target(images[0]), Target(images[1], rng.random((60, 80)) > 0.3)]
+    targets = [Target(images[0]), Target(images[1], rng.random((60, 80)) > 0.3)]
+    return wall, list(map(ObservedView.of, views, targets))
 
 
-def scores_of(wall, views, targets):
+def scores_of(wall, views):
     """Return the scores of one step in each view, and the gradient of the colours from its term."""
     scores = ErrorPerGaussian(N)
-    for view, target in zip(views, targets, strict=True):
+    for view in views:
         dr.enable_grad(wall.sh_coeffs)
-        image = view.render(wall, ("color",), ("features",), scores.features())
-        scores.observe(image, target, view.region)
+        image = render_view(wall, view, features=scores.features(), detach_weights=("features",))
+        scores.observe(image, view.target, view.region)
         term = scores.term
         assert np.asarray(term).item() == 0
         dr.backward(term)
@@ -67,11 +71,11 @@ def test_error_per_gaussian__ignores_noise():
     rng = np.random.default_rng(1)
     wall = sheet(rng)
     view = ActiveView(look_at_cameras([(0, 0.3, -3)], 45, 80, 60)[0])
-    image = np.asarray(view.render(wall).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(
+    image = np.asarray(render_view(wall, view).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(
         np.float32
     )
     image[20:30, 30:40] += 0.5
-    scores = scores_of(wall, [view], [Target(np.clip(image, 0, 1))])[0]
+    scores, _ = scores_of(wall, [ObservedView.of(view, Target(np.clip(image, 0, 1)))])
     pixels, _ = view.camera.project(np.asarray(wall.means))
     near = (np.abs(pixels - (35, 25)) < (12, 12)).all(axis=1)
     assert scores[~near].max() < 0.02 * scores[near].max()

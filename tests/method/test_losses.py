@@ -7,11 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.evaluate.metrics import ssim_map
 from morgs_mi.method.objective import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.ssim import Target
+from morgs_mi.method.ssim_layout import STRIP, Planes
 from morgs_mi.render.region import Region
+from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.reference import ssim_by_windows
@@ -113,7 +115,7 @@ def test_flow_loss__is_the_mean_endpoint_error():
     reliable = (rng.uniform(size=(8, 9)) > 0.3).astype(np.float32)
     x = mi.TensorXf(motion)
     dr.enable_grad(x)
-    loss = flow_loss(x, mi.TensorXf(observed), mi.TensorXf(reliable), reliable.size)
+    loss = flow_loss(x, mi.TensorXf(observed), mi.TensorXf(reliable), 1 / reliable.size)
     error = np.linalg.norm(motion - observed, axis=-1)
     assert item(loss) == pytest.approx((error * reliable).mean(), rel=1e-3)
     dr.backward(loss)
@@ -124,7 +126,7 @@ def test_flow_loss__is_the_mean_endpoint_error():
 def test_flow_loss__has_a_finite_gradient_where_both_agree():
     x = from_numpy(mi.TensorXf, np.ones((4, 4, 2), np.float32))
     dr.enable_grad(x)
-    dr.backward(flow_loss(x, dr.ones(mi.TensorXf, (4, 4, 2)), dr.ones(mi.TensorXf, (4, 4)), 16))
+    dr.backward(flow_loss(x, dr.ones(mi.TensorXf, (4, 4, 2)), dr.ones(mi.TensorXf, (4, 4)), 1 / 16))
     assert gradient(x).max() == 0
 
 
@@ -132,13 +134,15 @@ def test_mask_loss__is_the_mean_absolute_difference():
     rng = np.random.default_rng(4)
     confidence = rng.uniform(size=(6, 5, 1)).astype(np.float32)
     mask = rng.uniform(size=(6, 5)) > 0.5
-    loss = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32)), mask.size))
+    loss = item(
+        mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32)), 1 / mask.size)
+    )
     assert loss == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
 def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
     offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
-    assert item(offset_loss(mi.TensorXf(offset), 2.0, 7)) == pytest.approx(
+    assert item(offset_loss(mi.TensorXf(offset), 1 / (2.0 * 7))) == pytest.approx(
         np.abs(offset).sum(1).mean() / 2, rel=1e-5
     )
 
@@ -226,3 +230,17 @@ def test_target__is_not_changed_by_later_writes_to_its_image():
         0.75,
         1,
     ]
+
+
+@pytest.mark.parametrize("width", [4, 8, 12, 16])
+def test_runs__cover_the_strips_of_a_region_for_every_width_of_a_block(width):
+    rng = np.random.default_rng(0)
+    for shape in ((70, 150), (33, 101), (41, 97)):
+        drawn = rng.random(shape) < 0.01
+        region = Region.of(drawn, RenderConfig(block_width=width))
+        runs, count = Planes(*shape).runs(region, 0)
+        strips = np.pad(region.mask, ((0, 0), (0, -shape[1] % STRIP)))
+        strips = strips.reshape(shape[0], -1, STRIP).any(axis=2)
+        assert 3 * strips.sum() == (runs["end"] - runs["first"]).sum()
+        pixels = strips.repeat(STRIP, axis=1)[:, : shape[1]]
+        assert count == 3 * pixels.sum()

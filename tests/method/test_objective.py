@@ -1,7 +1,5 @@
 """The objective: which terms act where, what they need rendered, and what they add up."""
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -23,7 +21,6 @@ from morgs_mi.method.objective import (
     observe,
     weights_of,
 )
-from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import Image
 from tests.scenes.derivatives import gradient
@@ -74,42 +71,28 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
 
     guided = {"guided_motion": tensor(H, W, 2)}
     image = Image(color=tensor(H, W, 3), confidence=tensor(H, W, 1), others=guided)
-    previous_gaussians = to_gaussians(make_scene())
-    moved_gaussians = replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4))
+    gaussians = to_gaussians(make_scene())
     inputs = {
         "recon": image.color,
         "flow": image["guided_motion"],
         "mask": image.confidence,
         "offset": tensor(5, 3),
     }
-    inputs |= {
-        "rigid": moved_gaussians.means,
-        "rotation": moved_gaussians.quats,
-        "isometry": moved_gaussians.means,
-    }
     assert list(inputs) == NAMES, "a new term needs an input here"
     prediction = Prediction(
-        image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved_gaussians
+        image, {"offset": inputs["offset"]}, None, 1 / (H * W), 1 / 20, 2.0, gaussians, gaussians
     )
     observations = {
         "target": Target(np.zeros((H, W, 3), np.float32)),
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
         "reliable": mi.TensorXf(np.ones((H, W), np.float32)),
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
-        "neighbours": find_neighbours(previous_gaussians, 2.0),
     }
     assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {
         "recon",
         "offset",
     }
-    assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, (
-        "the others are off"
-    )
-    losses = losses_of(
-        prediction,
-        observations,
-        ObjectiveConfig(rigid_weight=1, rotation_weight=1, isometry_weight=1),
-    )
+    losses = losses_of(prediction, observations, ObjectiveConfig())
     assert list(losses) == NAMES
     for name, loss in losses.items():
         dr.backward(loss, flags=dr.ADFlag.ClearVertices)
@@ -120,15 +103,7 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
 
 def test_weights_of__are_those_of_the_settings():
     config = ObjectiveConfig(flow_weight=2.0, mask_weight=3.0, offset_weight=4.0)
-    assert weights_of(config) == {
-        "recon": 1,
-        "flow": 2,
-        "mask": 3,
-        "offset": 4,
-        "rigid": 0,
-        "rotation": 0,
-        "isometry": 0,
-    }
+    assert weights_of(config) == {"recon": 1, "flow": 2, "mask": 3, "offset": 4}
     with pytest.raises(ValueError, match="`flow_weight` must be at least 0, got -1"):
         ObjectiveConfig(flow_weight=-1)
 
@@ -158,7 +133,14 @@ def test_loss_term__acts_where_its_observation_exists(registry):
     assert weights_of(config)["height"] == 2.5
 
     prediction = Prediction(
-        Image(depth=mi.TensorXf(np.full((H, W, 1), 3.0))), {}, None, H * W, 1, 1.0, None
+        Image(depth=mi.TensorXf(np.full((H, W, 1), 3.0))),
+        {},
+        None,
+        1 / (H * W),
+        1.0,
+        1.0,
+        None,
+        None,
     )
     losses = losses_of(prediction, {"height": mi.TensorXf(observations["height"])}, config)
     assert losses.keys() == {"height"}

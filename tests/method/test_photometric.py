@@ -10,10 +10,11 @@ import pytest
 from morgs_mi import SH_C0
 from morgs_mi.method.motion import refine_start
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
+from tests.scenes.views import rendered_as
 
 SHIFT = np.float32([0.05, -0.03, 0.02])  # two pixels
 MOVING = 80
@@ -34,16 +35,12 @@ def scene():
             map(ActiveView, look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 128, 96))
         )
     )
-    return gaussians, views, targets(moved(gaussians), views)
+    return gaussians, rendered_as(moved(gaussians), views)
 
 
 def moved(gaussians):
     displacement = SHIFT * (np.arange(len(gaussians)) < MOVING)[:, None]
     return replace(gaussians, means=np.asarray(gaussians.means) + displacement)
-
-
-def targets(gaussians, views):
-    return {v: Target(np.asarray(view.render(gaussians).color)) for v, view in views.items()}
 
 
 def with_colors(gaussians, change):
@@ -78,7 +75,7 @@ def test_refine_start__keeps_true_motion(scene):
 
 
 def test_refine_start__takes_no_step_longer_than_the_limit(scene, monkeypatch):
-    gaussians, views, _ = scene
+    gaussians, views = scene
     monkeypatch.setattr("morgs_mi.method.motion.LONGEST_PX", 0.1)
     step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
     px = [
@@ -92,23 +89,23 @@ def test_refine_start__does_nothing_without_motion(scene):
     assert refined_from(scene, start(0.0)).displacement.any() == 0
 
 
-def color_change(gaussians, views, targets):
+def color_change(gaussians, views):
     """Return the change of colour of Gaussians that do not move."""
     still = MotionStart.without_motion(gaussians)
     return refine_start(
-        MotionProblem(gaussians, views, targets, np.random.default_rng(0)), still
+        MotionProblem(gaussians, views, np.random.default_rng(0)), still
     ).color_change
 
 
 def test_refine_start__follows_a_change_of_light(scene):
-    gaussians, views, _ = scene
+    gaussians, views = scene
     brighter = with_colors(gaussians, 0.1 / SH_C0)
-    bright_targets = targets(brighter, views)
-    followed = with_colors(gaussians, color_change(gaussians, views, bright_targets)[:, None])
+    bright_views = rendered_as(brighter, views)
+    followed = with_colors(gaussians, color_change(gaussians, bright_views)[:, None])
     differences = [
         [
-            np.abs(target.difference(views[v].render(shown).color)).mean()
-            for v, target in bright_targets.items()
+            np.abs(view.target.difference(render_view(shown, view).color)).mean()
+            for view in bright_views.values()
         ]
         for shown in (followed, gaussians)
     ]
@@ -117,20 +114,20 @@ def test_refine_start__follows_a_change_of_light(scene):
 
 
 def test_refine_start__trusts_few_pixels_less(scene):
-    gaussians, views, _ = scene
+    gaussians, views = scene
 
     def followed(sizes):
         smaller = replace(gaussians, log_scales=np.asarray(gaussians.log_scales) + np.log(sizes))
         return np.median(
-            color_change(smaller, views, targets(with_colors(smaller, 0.1 / SH_C0), views))
+            color_change(smaller, rendered_as(with_colors(smaller, 0.1 / SH_C0), views))
         )
 
     assert followed(0.2) < 0.3 * followed(1.0)
 
 
 def test_refine_start__takes_colours_where_the_step_leads(scene):
-    gaussians, views, images = scene
+    gaussians, views = scene
     displaced = replace(gaussians, means=np.asarray(gaussians.means) + start(0.6).displacement)
-    rest = color_change(displaced, views, images)[:MOVING]
+    rest = color_change(displaced, views)[:MOVING]
     changes = refined_from(scene, start(0.6)).color_change[:MOVING]
     assert np.abs(changes).mean() < 0.3 * np.abs(rest).mean()

@@ -5,14 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from morgs_mi import RenderConfig
-from morgs_mi.method.active_set import ChangedView, overlap, responsibility
-from morgs_mi.method.boxes import boxes_around
+from morgs_mi.method.active_set import ChangedViews, overlap, responsibility
 from morgs_mi.render.active_view import ActiveView, backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 RENDER = RenderConfig()
-CORE = 0.6
 WALL = 400
 SIDE = 96
 CAMERAS = dict(
@@ -30,12 +28,7 @@ def gaussians():
 
 
 def changed_views(gaussians, changes):
-    return [
-        ChangedView(
-            ActiveView(camera), changes[view], boxes_around(gaussians, camera, RENDER, CORE)
-        )
-        for view, camera in CAMERAS.items()
-    ]
+    return ChangedViews.of(gaussians, [*CAMERAS.values()], [*changes.values()], RENDER)
 
 
 def responsibility_for(gaussians, changes, width=640):
@@ -89,7 +82,7 @@ def test_responsibility__is_one_where_everything_changed_and_zero_where_nothing_
 
 
 def test_overlap__distinguishes_a_ball_from_the_wall_behind_it(gaussians):
-    result = overlap(len(gaussians), changed_views(gaussians, ball_moves()))
+    result = overlap(changed_views(gaussians, ball_moves()))
     assert result[WALL:].min() > 0.6
     assert np.median(result[:WALL]) < 0.15
 
@@ -97,6 +90,6 @@ def test_overlap__distinguishes_a_ball_from_the_wall_behind_it(gaussians):
 def test_overlap__counts_hidden_gaussians_and_only_views_in_which_they_are(gaussians):
     changes = {view: np.full((SIDE, SIDE), view == 0) for view in CAMERAS}
     views = changed_views(gaussians, changes)
-    areas = np.array([np.asarray(changed_view.boxes.area) for changed_view in views])
+    areas = np.reshape(views.boxes.area, (len(CAMERAS), -1))
     expected = np.where(areas[0] > 0, 1 / np.maximum((areas > 0).sum(axis=0), 1), 0)
-    assert_allclose(overlap(len(gaussians), views), expected, atol=1e-5)
+    assert_allclose(overlap(views), expected, atol=1e-5)

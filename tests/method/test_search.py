@@ -17,10 +17,10 @@ from morgs_mi.method.search import (
     _reduction,
     search_motion,
 )
-from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
+from tests.scenes.views import rendered_as
 
 SHIFT = np.float32([0.15, 0.05, 0.08])  # 12 px; the rod is 6 px wide
 CONFIG = SearchConfig()
@@ -45,10 +45,6 @@ def scene():
     return gaussians, dict(enumerate(map(ActiveView, look_at_cameras(places, 45, 160, 120))))
 
 
-def targets(gaussians, views):
-    return {v: Target(np.asarray(view.render(gaussians).color)) for v, view in views.items()}
-
-
 def moved(gaussians, shift=SHIFT):
     return replace(gaussians, means=np.asarray(gaussians.means) + shift * MOVES[:, None])
 
@@ -63,8 +59,8 @@ def start_of(shift=0 * SHIFT, logit=-2):
 def searched(scene, start, visible=None, config=CONFIG):
     """Search in the images of the Gaussians that are visible: by default the moved ones."""
     gaussians, views = scene
-    images = targets(moved(gaussians) if visible is None else visible, views)
-    problem = MotionProblem(gaussians, views, images, np.random.default_rng(0))
+    seen = rendered_as(moved(gaussians) if visible is None else visible, views)
+    problem = MotionProblem(gaussians, seen, np.random.default_rng(0))
     return search_motion(problem, start, config)
 
 
@@ -134,7 +130,7 @@ def test_initial_motion__searches_where_flow_sees_nothing(scene):
         config = MotionConfig(search_motion=searches)
         rng = np.random.default_rng(0)
         initial = initial_motion(
-            gaussians, active, flows, targets(moved(gaussians), views), config, rng
+            gaussians, active, rendered_as(moved(gaussians), views), flows, config, rng
         )
         assert initial.displacement[MOVES].any() == searches
 

@@ -1,5 +1,5 @@
-"""Cameras for Gaussians without a recording: they see the scene upright, whatever lies far outside
-of it.
+"""Cameras for Gaussians without a recording: they see an object completely and a scene upright,
+whatever lies far outside of it.
 """
 
 from dataclasses import replace
@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.playback.default_rig import default_rig
+from morgs_mi.playback.default_rig import default_rig, scene_box
 from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats
+
+
+def rig_around(gaussians, axes="y-down"):
+    """Return the cameras around the box of one frame."""
+    return default_rig([gaussians], scene_box([gaussians]), axes)
 
 
 @pytest.mark.parametrize(
     ("axes", "up"), [("y-down", (0, -1, 0)), ("y-up", (0, 1, 0)), ("z-up", (0, 0, 1))]
 )
 def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
-    cameras = default_rig([splats(300)], axes)
+    cameras = rig_around(splats(300), axes)
     means = splats(300).numpy()["means"]
     for camera in cameras:
         pixels, depths = camera.project(means)
@@ -35,9 +40,7 @@ def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
 
 @pytest.mark.parametrize("side", ["right", "back-left"])
 def test_default_rig__begins_where_the_scene_has_detail(side):
-    toward = next(camera for camera in default_rig([splats(1)]) if camera.name == side).viewmat[
-        2, :3
-    ]
+    toward = next(camera for camera in rig_around(splats(1)) if camera.name == side).viewmat[2, :3]
     steps = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(
         -1, 2
     )
@@ -51,7 +54,7 @@ def test_default_rig__begins_where_the_scene_has_detail(side):
         opacities=np.full(2 * len(sheet), 0.99),
         sh_coeffs=np.concatenate([colors, 0 * colors]),
     )
-    assert default_rig([scene])[0].name == side
+    assert rig_around(scene)[0].name == side
 
 
 def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
@@ -64,12 +67,35 @@ def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
     logits[100:150] = -8
     shown = replace(scene, means=means, logit_opacities=logits)
     positions = (
-        {camera.name: camera.position for camera in default_rig([gaussians])}
+        {camera.name: camera.position for camera in rig_around(gaussians)}
         for gaussians in (shown, scene)
     )
     assert_close(*(np.stack([rig[name] for name in sorted(rig)]) for rig in positions), atol=0.5)
 
 
 def test_default_rig__sees_a_single_gaussian():
-    for camera in default_rig([splats(1)]):
+    for camera in rig_around(splats(1)):
         assert_close(camera.project(splats(1).numpy()["means"])[0], [[640, 360]], atol=1e-6)
+
+
+def test_default_rig__sees_all_of_an_object():
+    """The head of a figure has 3 % of its opacity."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform((-0.2, 0, -0.1), (0.2, 1.5, 0.1), (970, 3))
+    head = rng.uniform((-0.1, -0.3, -0.1), (0.1, 0, 0.1), (30, 3))
+    figure = replace(splats(1000), means=np.concatenate([body, head]).astype(np.float32))
+    figure = replace(figure, log_scales=figure.log_scales - 3)
+    for camera in rig_around(figure):
+        pixels, _ = camera.project(figure.numpy()["means"])
+        margin = 0.02 * camera.height
+        assert (pixels > margin).all()
+        assert (pixels < [camera.width - margin, camera.height - margin]).all()
+        assert np.ptp(pixels, axis=0)[1] > 0.7 * camera.height
+
+
+def test_scene_box__leaves_out_the_surroundings_of_a_scene():
+    around = np.random.default_rng(0).uniform(-8, 8, (60, 3))
+    scene = splats(1000)
+    means = np.concatenate([scene.numpy()["means"][60:], around]).astype(np.float32)
+    low, high = scene_box([replace(scene, means=means)])
+    assert (high - low < 4).all()

@@ -1,6 +1,4 @@
-"""Streams of HDR recordings: files of linear light, displays after an exposure, and the light of
-inserted scenes.
-"""
+"""Streams of HDR recordings: files of linear light, displays after an exposure."""
 
 from dataclasses import replace
 
@@ -13,7 +11,6 @@ from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
-from morgs_mi.extras.light.insert import InsertConfig, render_inserted
 from morgs_mi.io.exr import read_light
 from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.player import render_stream
@@ -71,22 +68,3 @@ def test_write_images__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
     write(stream, tmp_path / "a.png", stream_exposure(stream))
     expected = (np.clip(rendered(stream), 0, 1) * 255 + 0.5).astype(np.uint8)
     assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], expected)
-
-
-@pytest.mark.slow
-def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(stream, tmp_path):
-    ball = {"type": "sphere", "center": [0, 0, -1], "radius": 0.2}
-    plain = open_stream(written(tmp_path / "plain.morgs", {}))
-
-    def inserted(stream, clipped):
-        config = InsertConfig(4, shadows=False, clipped=clipped)
-        (frame,) = render_inserted(
-            stream, camera(), lambda frame, time: {"ball": ball}, [0], config=config
-        )
-        return frame[1]["color"]
-
-    recorded = inserted(stream, 1.0)
-    guessed = inserted(plain, 4.0)
-    assert_array_equal(inserted(stream, None), recorded)
-    assert_array_equal(inserted(plain, None), guessed)
-    assert np.abs(recorded - guessed).max() > 0.1

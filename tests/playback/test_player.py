@@ -158,14 +158,21 @@ def test_channel_image__draws_other_channels_as_grey_values():
 
 
 @pytest.mark.parametrize("name", ["confidence", "error", "depth"])
-def test_explained_image__has_a_bar_of_the_colours_along_the_lower_edge(name):
+def test_explained_image__has_a_bar_of_the_colours_between_numbers_along_the_lower_edge(name):
     largest = 0.1 if name == "error" else 1
-    values = np.full((60, 200, 1), largest, np.float32)
-    values[:, :100] = largest / 2 if name == "depth" else 0
+    values = np.full((60, 400, 1), largest, np.float32)
+    values[:, :200] = largest / 2 if name == "depth" else 0
     image = explained_image(name, values)
-    assert_array_equal(image[30], channel_image(name, values)[30])
-    assert_array_equal(image[-1, [0, -1]], image[30, [0, -1]])
-    assert len(np.unique(image[-1], axis=0)) > 90
+    drawn = channel_image(name, values)
+    assert_array_equal(image[30], drawn[30])
+    bar = image[-1]
+    first, last = (np.flatnonzero((bar == drawn[30, k]).all(axis=1)) for k in (0, -1))
+    assert first[0] < 60, "after the number at the left"
+    assert last[-1] > 340
+    for number in (image[-10:, : first[0]], image[-10:, last[-1] + 1 :]):
+        assert set(np.unique(number[:, 0])) == {0}
+        assert number.max() == 255
+    assert len(np.unique(bar, axis=0)) > 90
     assert not np.array_equal(image[:10], explained_image(name, values, title="other")[:10])
 
 
@@ -176,6 +183,8 @@ def test_explained_image__has_the_wheel_of_motion_in_a_corner():
     assert (image[-size:, :-size] == 255).all()
     right = channel_image("motion", still + np.array([MOTION_SCALE * 200 * 0.9, 0]))[0, 0]
     assert np.abs(image[-size // 2, -2] - right.astype(int)).max() < 30
+    grey = explained_image("motion", still, color=np.full((100, 200, 3), 0.5))
+    assert (grey[-size:, :-size] == 128).all()
     color = np.random.default_rng(0).uniform(size=(9, 9, 3))
     assert_array_equal(explained_image("color", color), channel_image("color", color))
 

@@ -20,7 +20,9 @@ from morgs_mi.io.exr import read_exr
 from morgs_mi.io.ply import write_ply
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.export.web import write_web_folder
+from morgs_mi.playback.player import picture
 from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.visualise import GAP, label
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.testing import assert_close
 from tests.cli.commands import assert_refused
@@ -140,7 +142,12 @@ def test_render__draws_a_file_of_gaussians(tmp_path, run):
     write_ply(tmp_path / "scene.ply", splats(degree=2))
     stream = open_stream(tmp_path / "scene.ply")
     status, output, _ = run("render", stream.path, tmp_path / "a.png", "--width", 64)
-    assert (status, output) == (0, f"{tmp_path}/a.png: 1 image.\n")
+    assert status == 0
+    first, *others = [camera.name for camera in stream.cameras]
+    assert output.splitlines() == [
+        f"{tmp_path}/a.png: 1 image.",
+        f"Seen from {first} (most detail); also --camera {', '.join(others)} or all.",
+    ]
     image = np.array(rasterize(read_splats(stream.path), stream.cameras[0].with_width(64)).color)
     assert_close(
         cv2.imread(str(tmp_path / "a.png"))[..., ::-1] / 255,
@@ -151,6 +158,22 @@ def test_render__draws_a_file_of_gaussians(tmp_path, run):
         run("render", stream.path, tmp_path / "a.exr", "--width", 64, "--camera", "right")[0] == 0
     )
     assert read_exr(tmp_path / "a.exr")["depth.Y"].shape == (36, 64)
+
+
+def test_render__draws_a_thumbnail_for_each_camera(tmp_path, run):
+    write_ply(tmp_path / "scene.ply", splats(degree=2))
+    stream = open_stream(tmp_path / "scene.ply")
+    status, output, _ = run("render", stream.path, "--camera", "all", "--width", 64)
+    assert (status, output) == (0, f"{tmp_path}/scene-all.png: 8 cameras.\n")
+    sheet = cv2.imread(str(tmp_path / "scene-all.png"))[..., ::-1]
+    assert sheet.shape == (2 * 36 + GAP, 4 * 64 + 3 * GAP, 3)
+    camera = stream.cameras[6].resized(64, 36)
+    expected = label(picture(stream, read_splats(stream.path), camera), camera.name)
+    left = 2 * (64 + GAP)
+    assert np.array_equal(sheet[36 + GAP :, left : left + 64], expected)
+    assert_refused(
+        run("render", stream.path, tmp_path / "a.mp4", "--camera", "all"), "must be FILE.png"
+    )
 
 
 def test_render__names_what_is_no_file_of_gaussians(tmp_path, run):
@@ -168,7 +191,6 @@ def test_render__names_what_is_no_file_of_gaussians(tmp_path, run):
             "a.png: expected one image for one file, got 150; name a folder",
         ),
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
-        (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
     ],
 )
 def test_render__names_arguments_that_do_not_fit(tmp_path, run, args, message):

@@ -19,6 +19,15 @@ def test_motion_image__colours_are_as_documented():
     assert up.argmax() == 2
 
 
+def test_motion_image__is_over_the_grey_image():
+    motion = np.array([[[0, 0], [2.5, 0], [5, 0], [np.nan, 0]]])
+    color = np.array([[[255, 0, 0]] * 4], np.uint8)
+    grey = round(0.299 * 255)
+    half = round(grey / 2)
+    colors = visualise.motion_image(motion, 5.0, color)[0].tolist()
+    assert colors == [[grey] * 3, [half + 128, half, half], [255, 0, 0], [128, 128, 128]]
+
+
 def test_motion_legend__agrees_with_the_image():
     legend = visualise.motion_legend(8.0, size=101)
     expected = visualise.motion_image(np.array([[[0.0, 6.4]]]), 8.0)[0, 0]

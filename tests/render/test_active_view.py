@@ -1,18 +1,22 @@
 """An active view against the full view: same pixels, same gradients."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from morgs_mi import Gaussians, RenderConfig, rasterize
-from morgs_mi.render.active_view import ActiveView, backproject, make_active_view
+from morgs_mi.render.active_view import ActiveView, backproject
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_wide_camera
 from tests.scenes.derivatives import backward, gradient
 from tests.scenes.gaussians import CHANNELS, make_wide_scene
+from tests.scenes.views import make_active_view
 
 N = 120
 ACTIVE = np.arange(0, 120, 5)
@@ -52,7 +56,7 @@ def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaus
     view, active = split(camera, gaussians, mask)
     assert 0.1 < view.region.mask.mean() < 0.4
     dr.enable_grad(active.means, active.sh_coeffs, gaussians.means, gaussians.sh_coeffs)
-    image = view.render(active, CHANNELS)
+    image = render_view(active, view, CHANNELS)
     full = rasterize(gaussians, camera, CHANNELS)
     for name in CHANNELS:
         assert_close(image[name], view.crop(np.asarray(full[name])), name=name)
@@ -77,8 +81,31 @@ def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, 
     assert_close(backproject(active, view, view.crop(image)), expected, rtol=tol.SUM_ORDER_REL)
 
 
-def test_make_active_view__accepts_no_static_gaussians(camera, gaussians, mask):
-    none = gaussians.select(np.zeros(0, int))
+def test_with_static__accepts_no_static_gaussians_in_the_view(camera, gaussians, mask):
+    none = gaussians.select(np.arange(3))
+    none = replace(none, means=np.full((3, 3), -1e4))  # behind the camera
     view = make_active_view(camera, Region.of(mask), none, CHANNELS, RenderConfig())
+    assert view.static_splats is None
     full = rasterize(gaussians, camera, ("color",)).color
-    assert np.array_equal(view.render(gaussians).color, view.crop(np.asarray(full)))
+    assert np.array_equal(render_view(gaussians, view).color, view.crop(np.asarray(full)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"camera": None}, "`camera` must be a .*Camera, got a NoneType; convert a Mitsuba sensor"),
+        ({"config": {}}, "`config` must be a .*RenderConfig, got a dict"),
+        ({"region": "all"}, "`region` must be a .*Region, got a str"),
+        ({"static_splats": "all"}, "`static_splats` must be a .*StaticSplats"),
+    ],
+)
+def test_active_view__refuses_bad_arguments(camera, arguments, message):
+    with pytest.raises(ValueError, match=rf"ActiveView\(\): {message}"):
+        ActiveView(**{"camera": camera, **arguments})
+
+
+def test_render_view__refuses_bad_arguments(camera, gaussians):
+    with pytest.raises(ValueError, match=r"render_view\(\): `view` must be a .*ActiveView"):
+        render_view(gaussians, camera)
+    with pytest.raises(ValueError, match="`detach_weights` must be a sequence of names"):
+        render_view(gaussians, ActiveView(camera), detach_weights="color")

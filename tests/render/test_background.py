@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, RenderConfig, StreamLoop, fit_gaussians, rasterize
-from morgs_mi.core.png import PngImage, png_bytes
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.platform.png import PngImage, png_bytes
+from morgs_mi.playback.stream_header import render_config
 from morgs_mi.render.active_view import ActiveView, ViewGroup
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
+from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.testing import IMAGE_ABS, assert_close
 from tests.quick import NO_DENSITY, quick
 from tests.scenes.ball import opaque_ball
@@ -66,7 +73,7 @@ def test_active_views__draw_the_image_behind_their_region(gaussians):
     region = Region.of(mask)
     view = ActiveView(BEHIND, region=region)
     expected = over(gaussians, IMAGE)
-    assert_close(view.render(gaussians).color, region.crop(expected), atol=IMAGE_ABS)
+    assert_close(render_view(gaussians, view).color, region.crop(expected), atol=IMAGE_ABS)
     other = ActiveView(replace(CAMERA, background=1 - IMAGE))
     group = ViewGroup([view, other])
     color = np.asarray(group.draw(gaussians).color).reshape(group.region.shape(3))
@@ -124,9 +131,9 @@ def test_fit_gaussians__equals_the_loop_over_a_colour_and_over_images():
         loop = StreamLoop(views, *cloud, settings)
         loop.push(images)
         fitted = fit_gaussians(cameras, images, *cloud, config, background=background)
-        for name, value in fitted.numpy().items():
+        for name, value in fitted.gaussians.numpy().items():
             assert np.array_equal(value, loop.gaussians.numpy()[name]), name
-        results.append(fitted.numpy()["sh_coeffs"])
+        results.append(fitted.gaussians.numpy()["sh_coeffs"])
     assert np.abs(results[0] - results[1]).max() > 0.01
     with pytest.raises(ValueError, match=r"`background` must be .* \[4, 48, 64, 3\]"):
         fit_gaussians(cameras, images, *cloud, config, background=behind[:2])
@@ -152,3 +159,49 @@ def test_stream_loop__fits_what_stands_before_the_background():
         image = np.array(rasterize(loop.gaussians, other, config=settings).color)
         scores.append(psnr(np.clip(image, 0, 1), truth))
     assert scores[1] > scores[0] + 6
+
+
+def test_fits__without_points_find_the_colour_of_the_borders(caplog):
+    """Fits and resumed ones use it, unless there are points or a background is given."""
+    cameras = look_at_cameras(QUAD, 60)
+    color = (0.2, 0.6, 0.8)
+    behind = RenderConfig(background=color)
+    images = [
+        np.uint8(
+            255 * np.clip(np.array(rasterize(opaque_ball(), c, config=behind).color), 0, 1) + 0.5
+        )
+        for c in cameras
+    ]
+    fitted = fit_gaussians(cameras, images, config=quick())
+    assert_close(fitted.background, color, atol=IMAGE_ABS)
+    assert "the colour of the images' borders, (0.2, 0.6, 0.8)" in caplog.messages[0]
+    none = np.zeros((0, 3)), np.zeros((0, 3))
+    loop = StreamLoop(cameras, *none, quick())
+    loop.push(images)
+    assert loop.setup.config.render == fitted.render
+    resumed = StreamLoop(cameras, *none, quick())
+    resumed.resume(loop.state.coded, [images], loop.state.exposures)
+    next_images = [np.roll(image, 3, axis=1) for image in images]
+    packets = [each.push(next_images)[0] for each in (loop, resumed)]
+    for name, values in packets[0].arrays.items():
+        assert np.array_equal(values, packets[1].arrays[name]), name
+    points = opaque_ball().numpy()["means"]
+    assert fit_gaussians(cameras, images, points, config=quick()).background is None
+    white = (1.0, 1.0, 1.0)
+    assert fit_gaussians(cameras, images, config=quick(), background=white).background == white
+
+
+def test_stream_capture__without_points_stores_the_colour_of_the_borders(tmp_path):
+    cameras = look_at_cameras(QUAD, 60, 96, 72)
+    behind = RenderConfig(background=(0.2, 0.6, 0.8))
+    write_colmap(tmp_path / "clip/sparse", cameras)
+    for camera in cameras:
+        color = np.clip(np.array(rasterize(opaque_ball(), camera, config=behind).color), 0, 1)
+        frames = 3 * [np.uint8(255 * color + 0.5)]
+        write_video(tmp_path / f"clip/{camera.name}.mkv", frames, 30)
+    capture = load_capture(tmp_path / "clip")
+    reports = stream_capture(capture, tmp_path / "fit", quick())
+    stream = StreamReader(tmp_path / "fit/stream.morgs")
+    assert_close(render_config(stream).background, behind.background, atol=2 / 255)
+    resumed = stream_capture(capture, tmp_path / "fit", quick(), resume=True)
+    assert len(resumed) == len(reports), "the same settings"

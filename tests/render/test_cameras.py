@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi import rasterize
-from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import make_camera
 from tests.scenes.derivatives import gradient
@@ -81,8 +80,6 @@ def test_rasterize__refuses_cameras_that_do_not_fit(gaussians):
         rasterize(gaussians, [first, replace(second, width=90)])
     with pytest.raises(ValueError, match="got an empty sequence"):
         rasterize(gaussians, [])
-    with pytest.raises(ValueError, match="`region` must be None with a sequence of cameras"):
-        rasterize(gaussians, [first], region=Region.of(np.ones((37, 45), bool)))
 
 
 def test_rasterize__draws_no_gaussians_in_several_cameras(gaussians):

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import rasterize
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
@@ -54,7 +56,7 @@ def test_rasterize__renders_on_a_region_a_new_attribute_of_the_table(scene):
     mask = np.zeros((camera.height, camera.width), bool)
     mask[9, 10] = True
     region = Region.of(mask)
-    image = rasterize(gaussians, camera, ("roughness", "confidence"), region=region)
+    image = render_view(gaussians, ActiveView(camera, region=region), ("roughness", "confidence"))
     assert_close(image["roughness"], image.confidence)
 
 

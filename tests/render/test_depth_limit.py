@@ -8,7 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import erf
 
 from morgs_mi import Gaussians, RenderConfig, rasterize
+from morgs_mi.render.active_view import ActiveView, StaticSplats
 from morgs_mi.render.projection import project
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import reference
@@ -39,7 +41,9 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
     raw, camera = scene
     expected = rasterize_view(raw, camera, depth_limit=limit)
     solid = expected["alpha"] > 0.2 if channel in ("depth", "motion") else True
-    image = rasterize(to_gaussians(raw), camera, (channel,), depth_limit=limit)[channel]
+    image = render_view(to_gaussians(raw), ActiveView(camera), (channel,), depth_limit=limit)[
+        channel
+    ]
     assert_close(image, expected[channel], atol=5 * tol.IMAGE_ABS, where=solid)
 
 
@@ -64,7 +68,7 @@ def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
 def test_depth_limit__at_infinity_changes_no_bit(scene):
     raw, camera = scene
     limit = np.full((camera.height, camera.width), np.inf)
-    image = rasterize(to_gaussians(raw), camera, CHANNELS, depth_limit=limit)
+    image = render_view(to_gaussians(raw), ActiveView(camera), CHANNELS, depth_limit=limit)
     expected = rasterize(to_gaussians(raw), camera, CHANNELS)
     for name in CHANNELS:
         assert_array_equal(image[name], expected[name])
@@ -75,7 +79,7 @@ def test_depth_limit__draws_nothing_where_the_gaussian_is_too_faint(scene):
     faint = to_gaussians({**raw, "log_scales": np.full_like(raw["log_scales"], np.log(0.1))})
     limit = np.full((camera.height, camera.width), np.linalg.norm(camera.position))
     uncut = np.array(rasterize(faint, camera, ("alpha",)).alpha)
-    alpha = np.array(rasterize(faint, camera, ("alpha",), depth_limit=limit).alpha)
+    alpha = np.array(render_view(faint, ActiveView(camera), ("alpha",), depth_limit=limit).alpha)
     assert (uncut == 0).any()
     assert not alpha[uncut == 0].any()
 
@@ -88,7 +92,8 @@ def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
     colors = rng.uniform(-1, 1, (60, 1, 3))
     cloud = isotropic(means, 0.05, 0.7, colors)
     near = isotropic(means[:30], 0.05, 0.7, colors[:30])
-    image = rasterize(cloud, camera, depth_limit=np.full((camera.height, camera.width), 4.0))
+    limit = np.full((camera.height, camera.width), 4.0)
+    image = render_view(cloud, ActiveView(camera), ("color", "alpha"), depth_limit=limit)
     expected = rasterize(near, camera)
     for name in ("color", "alpha"):
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
@@ -122,9 +127,8 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
     fraction = np.sum(density * (points @ normal < 0), axis=0) / np.sum(density, axis=0)
 
     alpha = np.asarray(rasterize(gaussians, camera, ("alpha",)).alpha, np.float64)[rows, columns, 0]
-    cut_alpha = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[
-        rows, columns, 0
-    ]
+    cut = render_view(gaussians, ActiveView(camera), ("alpha",), depth_limit=limit)
+    cut_alpha = np.asarray(cut.alpha)[rows, columns, 0]
     assert 0.1 < fraction[alpha > 0.5].min() < 0.4 < fraction[alpha > 0.5].max() < 0.9
     # Low-pass filter, affine approximation over 3 degrees, and approximation of the distribution
     # function.
@@ -134,9 +138,8 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
 def test_profile__is_the_depth_of_the_largest_response_along_the_ray():
     """t* = d'S^-1 mu / d'S^-1 d for the ray direction d, in camera space."""
     gaussians, camera = _large_gaussian()
-    z, gx, gy, r_sigma = (
-        float(v[0]) for v in project(gaussians, camera, ("profile",), RenderConfig()).profile
-    )
+    profile = project(gaussians, camera, ("profile",), RenderConfig()).profile
+    z, gx, gy, r_sigma = (float(v[0]) for v in (profile.mean, *profile.slope, profile.r_sigma))
     R = np.asarray(camera.viewmat)[:3, :3] @ reference.rotation(
         np.asarray(gaussians.quats[0]).ravel()
     )
@@ -154,8 +157,10 @@ def test_depth_limit__on_a_region_equals_the_full_image(scene, limit):
     mask = np.zeros((camera.height, camera.width), bool)
     mask[5:9, 6:17] = True
     region = Region.of(mask)
-    full = rasterize(to_gaussians(raw), camera, ("color",), depth_limit=limit).color
-    part = rasterize(to_gaussians(raw), camera, ("color",), depth_limit=limit, region=region).color
+    full, part = (
+        render_view(to_gaussians(raw), view, depth_limit=limit).color
+        for view in (ActiveView(camera), ActiveView(camera, region=region))
+    )
     assert_close(part, region.crop(np.asarray(full)), atol=tol.IMAGE_ABS)
 
 
@@ -177,18 +182,20 @@ def test_reference__distribution_function_is_the_normal_one():
 )
 def test_depth_limit__refuses_bad_input(scene, make, message):
     raw, camera = scene
+    limit = make(camera.height, camera.width)
     with pytest.raises(ValueError, match=message):
-        rasterize(to_gaussians(raw), camera, depth_limit=make(camera.height, camera.width))
+        render_view(to_gaussians(raw), ActiveView(camera), depth_limit=limit)
 
 
 def test_depth_limit__refuses_gradients_and_static_splats(scene):
     raw, camera = scene
     limit = mi.TensorXf(np.ones((camera.height, camera.width), np.float32))
     static = project(to_gaussians(raw), camera, ("color",), RenderConfig())
+    view = ActiveView(camera, static_splats=StaticSplats(static, 0, len(static)))
     with pytest.raises(
         ValueError, match="`depth_limit` must be None where `static_splats` are given"
     ):
-        rasterize(to_gaussians(raw), camera, ("color",), static_splats=static, depth_limit=limit)
+        render_view(to_gaussians(raw), view, depth_limit=limit)
     dr.enable_grad(limit)
     with pytest.raises(ValueError, match="gets no gradient"):
-        rasterize(to_gaussians(raw), camera, depth_limit=limit)
+        render_view(to_gaussians(raw), ActiveView(camera), depth_limit=limit)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, RenderConfig, rasterize
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
@@ -104,7 +106,9 @@ def test_rasterize__gradient_of_the_pose_agrees_with_the_reference(scene):
 def test_rasterize__detached_weights_give_geometry_no_gradient(scene):
     raw, camera = scene
     gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, ("color", "motion"), detach_weights=("motion",))
+    image = render_view(
+        gaussians, ActiveView(camera), ("color", "motion"), detach_weights=("motion",)
+    )
     backward(image.motion)
     assert np.abs(np.asarray(dr.grad(gaussians.motion))).max() > 0
     for name in ("log_scales", "quats", "logit_opacities", "sh_coeffs"):

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, RenderConfig, rasterize
+from morgs_mi import ActiveView, Camera, RenderConfig, render_view
+from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import make_scene, to_gaussians
@@ -15,7 +16,7 @@ W = 9
 H = 6
 CAMERA = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, W, H)
 WEIGHTS = np.random.default_rng(0).normal(size=(H, W, 3)).astype(np.float32)
-CONFIG = RenderConfig(alpha_min=1e-9, stop_transmittance=1e-9)
+VIEW = ActiveView(CAMERA, RenderConfig(alpha_min=1e-9, stop_transmittance=1e-9))
 COUNT = 10
 
 
@@ -27,7 +28,7 @@ def gradient(weights):
     """Return dL/d means2d [N, 4] for the loss <image, weights>."""
     probe = dr.zeros(mi.TensorXf, (COUNT, 4))
     dr.enable_grad(probe)
-    image = rasterize(gaussians(), CAMERA, ("color",), config=CONFIG, means2d=probe)
+    image = render_view(gaussians(), VIEW, means2d=probe)
     backward(image.color * mi.TensorXf(weights))
     return np.array(dr.grad(probe))
 
@@ -37,7 +38,7 @@ def test_means2d__signed_gradient_agrees_with_central_differences():
 
     def loss(shift):
         probe = mi.TensorXf(shift.astype(np.float32))
-        image = rasterize(gaussians(), CAMERA, ("color",), config=CONFIG, means2d=probe)
+        image = render_view(gaussians(), VIEW, means2d=probe)
         return np.sum(np.array(image.color, float) * WEIGHTS)
 
     differences = np.zeros((COUNT, 2))
@@ -62,7 +63,7 @@ def test_means2d__leaves_image_and_other_gradients_unchanged():
     for probe in (None, dr.zeros(mi.TensorXf, (COUNT, 4))):
         splats = gaussians()
         dr.enable_grad(splats.means)
-        image = rasterize(splats, CAMERA, ("color",), means2d=probe).color
+        image = render_view(splats, ActiveView(CAMERA), means2d=probe).color
         backward(image * mi.TensorXf(WEIGHTS))
         results.append((np.array(image), np.array(dr.grad(splats.means))))
     for plain, probed in zip(*results, strict=True):
@@ -73,11 +74,14 @@ def test_means2d__leaves_image_and_other_gradients_unchanged():
     ("options", "words"),
     [
         ({"means2d": np.zeros((COUNT, 4))}, r"`means2d` must be a tensor of zeros \[10, 4\]"),
-        ({"camera": [CAMERA, CAMERA]}, "`means2d` must be None with a sequence of cameras"),
+        (
+            {"view": ActiveView(CAMERA, region=Region.of(np.ones((H, W), bool)))},
+            "`region` must be None with `means2d`",
+        ),
         ({"depth_limit": np.ones((H, W))}, "`depth_limit` must be None with `means2d`"),
     ],
 )
 def test_means2d__refuses_what_it_cannot_do(options, words):
-    options = {"camera": CAMERA, "means2d": dr.zeros(mi.TensorXf, (COUNT, 4)), **options}
+    options = {"view": ActiveView(CAMERA), "means2d": dr.zeros(mi.TensorXf, (COUNT, 4)), **options}
     with pytest.raises(ValueError, match=words):
-        rasterize(gaussians(), **options)
+        render_view(gaussians(), **options)

@@ -7,6 +7,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import BlockGrid, Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
@@ -40,7 +42,8 @@ def mask(camera):
 def run(raw, camera, region=None, weight=None, config=None):
     """Return images and gradients of <image, weight>, with the weight cropped to the region."""
     gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, config=config)
+    view = ActiveView(camera, config or RenderConfig(), region)
+    image = render_view(gaussians, view, CHANNELS, BACKGROUND)
     images = {name: image[name] for name in CHANNELS}
     if weight is not None:
         cropped = {name: region.crop(w) if region else w for name, w in weight.items()}
@@ -95,16 +98,17 @@ def test_rasterize__blends_features_on_a_region(raw, camera, mask):
     region = Region.of(mask)
     values = np.float32(rng.normal(size=(len(raw["means"]), 5)))
 
-    def run_features(**restriction):
+    def run_features(where=None):
         features = mi.TensorXf(values)
         dr.enable_grad(features)
-        image = rasterize(Gaussians(**raw), camera, (), features=features, **restriction).features
-        shown = image * (1 if restriction else mi.TensorXf(np.float32(drawn_pixels(region, mask))))
+        view = ActiveView(camera, region=where)
+        image = render_view(Gaussians(**raw), view, (), features=features).features
+        shown = image * (1 if where else mi.TensorXf(np.float32(drawn_pixels(region, mask))))
         backward(dr.square(shown))
         return np.asarray(dr.detach(image)), gradient(features)
 
     expected, full = run_features()
-    blend, grad = run_features(region=region)
+    blend, grad = run_features(region)
     assert np.array_equal(blend, region.crop(expected))
     assert np.abs(full).max() > 0
     assert_close(grad, full, atol=tol.SUM_ORDER_REL * np.abs(full).max())
@@ -115,7 +119,7 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
     results = []
     for where in (region, None):
         gaussians = to_gaussians(raw, grad=True)
-        image = rasterize(gaussians, camera, CHANNELS, region=where)
+        image = render_view(gaussians, ActiveView(camera, region=where), CHANNELS)
         outputs = [image[name] for name in CHANNELS]
         results.append(tangents(gaussians, random_direction(raw, 1), outputs))
     for name, tangent, expected in zip(CHANNELS, *results, strict=True):
@@ -125,9 +129,8 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
 
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
     raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
-    image = rasterize(
-        Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region.of(mask)
-    )
+    view = ActiveView(camera, region=Region.of(mask))
+    image = render_view(Gaussians(**raw), view, ("color", "depth"), BACKGROUND)
     pixels = Region.of(mask).crop(np.ones(mask.shape, bool))
     assert np.array_equal(
         np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1))
@@ -151,7 +154,7 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
 
     def step(where):
         gaussians = to_gaussians(raw, grad=True)
-        image = rasterize(gaussians, camera, ("color",), region=Region.of(where))
+        image = render_view(gaussians, ActiveView(camera, region=Region.of(where)))
         backward(image.color)
         dr.eval(dr.grad(gaussians.means))
         dr.sync_thread()
@@ -161,14 +164,13 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
 
 
 def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
-    gaussians = Gaussians(**raw)
     with pytest.raises(ValueError, match=r"`region` must be of a 101x75 view with [48]x4 blocks"):
-        rasterize(gaussians, camera, region=Region.of(mask[:, :-1]))
+        ActiveView(camera, region=Region.of(mask[:, :-1]))
     with pytest.raises(ValueError, match="got 101x75 with 16x4"):
-        rasterize(gaussians, camera, region=Region.of(mask, RenderConfig(block_width=16)))
+        ActiveView(camera, region=Region.of(mask, RenderConfig(block_width=16)))
     broken = raw | {"means": np.where(np.arange(360).reshape(120, 3) == 7, np.nan, raw["means"])}
     with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[2, 1\]"):
-        rasterize(Gaussians(**broken), camera, region=Region.of(mask))
+        render_view(Gaussians(**broken), ActiveView(camera, region=Region.of(mask)))
 
 
 @pytest.mark.parametrize("offset", range(4))

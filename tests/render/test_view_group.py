@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from morgs_mi import Gaussians, RenderConfig, rasterize
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.render.active_view import ActiveView, ViewGroup, backproject, make_active_view
+from morgs_mi.core.arrays import from_numpy
+from morgs_mi.render.active_view import ActiveView, ViewGroup, backproject
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_camera, make_wide_camera
 from tests.scenes.gaussians import as_float32, make_scene, make_wide_scene, to_gaussians
+from tests.scenes.views import make_active_view
 
 N = 120
 ACTIVE = np.arange(0, 120, 5)
@@ -77,7 +79,7 @@ def test_view_group__draws_what_each_view_draws(gaussians):
         views, group.regions, images, weights, sums, strict=True
     ):
         blocks = replace(view, region=region)
-        assert_close(image, np.asarray(blocks.render(active).color), rtol=1e-6, atol=1e-6)
+        assert_close(image, np.asarray(render_view(active, blocks).color), rtol=1e-6, atol=1e-6)
         assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
 

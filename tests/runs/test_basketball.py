@@ -15,7 +15,7 @@ import pytest
 
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 
 FOLDER = os.environ.get("MORGS_MI_BASKETBALL")
 FRAMES = 30

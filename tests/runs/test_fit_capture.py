@@ -21,11 +21,12 @@ from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.files import write_json
-from morgs_mi.core.progress import Progress
+from morgs_mi.core.view import Views
 from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.files import write_json
+from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next, with_points
 from morgs_mi.runs.fit_files import Recording as Files
@@ -281,7 +282,7 @@ def brighter(capture):
             r"resume a fit with metadata\.config\.seed = 0, got 1",
         ),
         (brighter(recording()), CONFIG, r"resume a fit with metadata\.fingerprint = "),
-        (recording(cameras=recording().cameras[::-1]), CONFIG, "resume a fit with cameras = "),
+        (recording(views=Views(recording().views[::-1])), CONFIG, "resume a fit with cameras = "),
     ],
 )
 def test_stream_capture__does_not_resume_another_fit(whole, tmp_path, capture, config, message):
@@ -501,7 +502,7 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_f
     assert names == set(capture.names[1:]), "the terms of the training views"
     opened = open_stream_capture(stream, None, [0, 1])
     assert np.array_equal(opened.cameras[1].viewmat, stream.cameras[1].viewmat)
-    assert [list(terms) for terms in opened.distortions[1:]] == [
+    assert [list(view.distortion) for view in opened.views[1:]] == [
         *stream.metadata["distortions"].values()
     ]
     assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), (
@@ -559,6 +560,6 @@ def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
     frame = next(capture.partial_frames())
     same, different = (
         stream_metadata(c, frame, refined_config())["fingerprint"]
-        for c in (capture, replace(capture, cameras=(wider, *others)))
+        for c in (capture, capture.with_cameras((wider, *others)))
     )
     assert same != different

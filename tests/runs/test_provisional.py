@@ -8,8 +8,8 @@ import pytest
 
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.fit.fit_config import DensityConfig
+from morgs_mi.platform.files import PROVISIONAL
 from morgs_mi.runs import fit_capture
 from morgs_mi.runs.fit_capture import FirstFrameProgress, stream_capture
 from morgs_mi.runs.fit_files import ProvisionalFrame

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 
 from morgs_mi import RenderConfig, rasterize
+from morgs_mi.core.view import View
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.initialise import FirstFrameProblem, from_points
-from morgs_mi.fit.view import View
 from tests.scenes.cameras import QUAD, look_at_cameras
 
 

@@ -257,6 +257,34 @@ def qualisys(path, distortions=(0, 0, 0, 0)):
     return path
 
 
+def easymocap(path, distortions=(0, 0, 0, 0, 0), clips=folder_per_camera, lens_key="dist"):
+    """Write a calibration of EasyMocap with a camera that has no clip, beside the clips of the
+    others in `images`.
+    """
+    path.mkdir(parents=True)
+    names = ("1", "2", "10", "31")
+    intrinsics = cv2.FileStorage(str(path / "intri.yml"), cv2.FILE_STORAGE_WRITE)
+    poses = cv2.FileStorage(str(path / "extri.yml"), cv2.FILE_STORAGE_WRITE)
+    for storage in (intrinsics, poses):
+        storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+        for name in names:
+            storage.write("", name)
+        storage.endWriteStruct()
+    for camera in rig(names, shift=3):
+        # OpenCV puts pixel centres at integers.
+        K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        intrinsics.write(f"K_{camera.name}", K)
+        intrinsics.write(f"{lens_key}_{camera.name}", np.array([distortions], np.float64))
+        rotation = camera.viewmat[:3, :3]
+        poses.write(f"R_{camera.name}", Rotation.from_matrix(rotation).as_rotvec()[:, None])
+        poses.write(f"Rot_{camera.name}", rotation)
+        poses.write(f"T_{camera.name}", camera.viewmat[:3, 3:])
+    intrinsics.release()
+    poses.release()
+    clips(path / "images", names[:3])
+    return path
+
+
 def dot_clips(path, names, point, lens, deviation=1.5):
     """Write clips of a bright dot at `point`, `deviation` px wide, recorded through OpenCV's lens
     by the rig with principal points off by 3.

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig, rasterize
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
@@ -53,7 +55,7 @@ def assert_gradients_of_reference(
     """Compare the gradients of the weighted sum of a channel, zero where the reference's are."""
     gaussians = to_gaussians(raw, grad=True)
     config = RenderConfig(antialiased=antialiased)
-    image = rasterize(gaussians, camera, (channel,), config=config, **options)
+    image = render_view(gaussians, ActiveView(camera, config), (channel,), **options)
     backward(image[channel] * mi.TensorXf(np.float32(weight)))
 
     def loss(values):
@@ -72,7 +74,7 @@ def assert_forward_agrees_with_reference(raw, camera, channels, rtol, **limit):
     """Compare the derivatives of channels along a random change of all attributes."""
     direction = random_direction(raw, 2)
     gaussians = to_gaussians(raw, grad=True)
-    image = rasterize(gaussians, camera, channels, **limit)
+    image = render_view(gaussians, ActiveView(camera), channels, **limit)
     solid = rasterize_view(raw, camera, **limit)["alpha"] > 0.02
     results = tangents(gaussians, direction, [image[name] for name in channels])
     for name, result in zip(channels, results, strict=True):

@@ -6,8 +6,8 @@ from unittest.mock import Mock
 import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.core.png import png_bytes
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.platform.png import png_bytes
 from tests.quick import quick
 from tests.scenes import filmed, textured
 

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.capture import Capture, PartialFrame, RecordedView
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec import container
 from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.core.view import Views
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.playback.visualise import write_png
@@ -44,7 +45,7 @@ class Recording(Capture):
         for t in range(start, self.num_frames if stop is None else stop):
             images = np.stack(walls)
             images[:, 8:16, 2 * t % 24 : 2 * t % 24 + 8] = (255, 200, 40)
-            yield PartialFrame(t, tuple(images))
+            yield PartialFrame(t, self.views.at(images))
 
     def metadata(self):
         return {"layout": "noise"}
@@ -56,15 +57,12 @@ def recording(**changes):
     views = look_at_cameras([(x, 0, -3) for x in (-1, 0, 1)], 60, 32, 24)
     fields = {
         "path": Path("noise"),
-        "cameras": tuple(views),
+        "views": Views(RecordedView(view, source=None) for view in views),
         "num_frames": FRAMES,
         "fps": 25.0,
         "points": rng.uniform(-1, 1, (150, 3)).astype(np.float32),
         "point_colors": rng.uniform(0, 1, (150, 3)).astype(np.float32),
-        "masks": (None,) * 3,
-        "test_views": (),
         "truth": None,
-        "_sources": (),
     }
     return Recording(**(fields | changes))
 

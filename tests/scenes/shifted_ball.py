@@ -9,8 +9,8 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.ssim import Target
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
+from tests.scenes.views import observed
 
 SHIFT = np.array([0.06, -0.03, 0.02], np.float32)
 EXTENT = 3.0
@@ -28,8 +28,8 @@ def fit_shifted(motion, start=None, config=FIT):
     """Fit the ball to images of its shifted self, with the same bytes on every run."""
     ball = opaque_ball()
     active = full_active_set(ball, dict(enumerate(views())), RenderConfig())
-    targets = {view: Target(image) for view, image in enumerate(images_of(shifted_ball()))}
-    problem = FrameProblem(ball, active, targets, {}, start, EXTENT)
+    fitted_views = observed(active.views, images_of(shifted_ball()))
+    problem = FrameProblem(ball, active, fitted_views, start, EXTENT)
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 

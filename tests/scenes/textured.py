@@ -45,9 +45,7 @@ def write_capture(path):
 
 def with_cameras(capture, change):
     """Return the capture with the cameras that `change` returns for an index and a camera."""
-    return replace(
-        capture, cameras=tuple(change(i, camera) for i, camera in enumerate(capture.cameras))
-    )
+    return capture.with_cameras([change(i, camera) for i, camera in enumerate(capture.cameras)])
 
 
 def turned(camera, degrees):

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # run.sh BUNDLE OUT [VARIANT]: check and time the package, in the checkout's root on a machine with
-# a GPU; three minutes. Results and logs are written to OUT, also when a step fails. The exit status
+# a GPU; five minutes. Results and logs are written to OUT, also when a step fails. The exit status
 # is the number of steps that failed.
 set -u
 bundle=$1
@@ -26,5 +26,7 @@ step check 100 python3 tools/gpu/check.py "$variant" "$out/check.npz" "$bundle/r
 step speed 120 python3 tools/gpu/speed.py "$variant" "$out/speed.json"
 step frames 260 python3 -m benchmarks.speed.frame_speed --variant "$variant" --epochs 2 --full \
   --json "$out/frames.json"
+step host 100 python3 -m benchmarks.speed.host --variant "$variant" --sizes floor small \
+  --json "$out/host.json"
 step tests 200 python3 -m pytest -q -n 4 -p no:cacheprovider tests/render
 exit "$failed"

@@ -25,11 +25,11 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import few, require
 from morgs_mi.core.rig import far_origin, moved, scene_extent
 from morgs_mi.io.clip_readers import Clip
 from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
 from morgs_mi.io.numbering import frame_numbers, natural_key
+from morgs_mi.platform.checks import few, require
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,22 +38,33 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 @dataclass(frozen=True)
+class CalibratedView:
+    """A camera of a capture folder, at the calibrated size, with its clip."""
+
+    camera: Camera  #: The camera.
+    lens: Lens  #: The lens that the clip was recorded through.
+    clip: Clip  #: A video, a folder of images or a list of images.
+    #: Images of the clip's size or scaled versions, whose black pixels are not used; no images: all
+    #: pixels are used.
+    masks: tuple[Path, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the camera."""
+        return self.camera.name
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Cameras, clips and points of a capture folder, at the calibrated size."""
 
-    cameras: tuple[Camera, ...]  #: In numerical order of their names.
-    lenses: tuple[Lens, ...]  #: One per camera.
-    clips: tuple[Clip, ...]  #: One per camera: its video, folder of images or list of images.
+    views: tuple[CalibratedView, ...]  #: In numerical order of their names.
     #: [P, 3], world units, in the file's precision; P = 0 if the layout has none.
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
     #: [P, 3] float32 in [0, 1].
     point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
-    #: Indices of the cameras that the layout holds out, in ascending order; None if it specifies
-    #: none.
-    test_views: tuple[int, ...] | None = None
-    #: Per camera images of its clip's size or scaled versions, whose black pixels are not used; no
-    #: images: all pixels are used.
-    masks: tuple[tuple[Path, ...], ...] = ()
+    #: Names of the cameras that the layout holds out; None if it specifies none.
+    held_out: tuple[str, ...] | None = None
     #: Point of the file's world that cameras and points are relative to.
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     #: Names of clips without a camera, and of cameras without a clip, which are left out.
@@ -62,7 +73,7 @@ class Calibration:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the cameras."""
-        return tuple(camera.name for camera in self.cameras)
+        return tuple(view.name for view in self.views)
 
     def centred(self, path: Path) -> Calibration:
         """Return the calibration relative to the `far_origin` of its cameras, with float32 points;
@@ -70,10 +81,12 @@ class Calibration:
 
         Points that the file has rounded are left out.
         """
-        origin = far_origin(self.cameras)
+        cameras = [view.camera for view in self.views]
+        origin = far_origin(cameras)
+        local = zip(self.views, moved(cameras, origin), strict=True)
         result = replace(
             self,
-            cameras=moved(self.cameras, origin),
+            views=tuple(replace(view, camera=camera) for view, camera in local),
             points=(self.points - origin).astype(np.float32),
             origin=tuple(origin.tolist()),
         )
@@ -82,7 +95,7 @@ class Calibration:
         rounding = np.spacing(
             np.abs(origin).max().astype(np.promote_types(self.points.dtype, "f4"))
         )
-        coarse = len(self.points) and rounding > 1e-3 * scene_extent(self.cameras)
+        coarse = len(self.points) and rounding > 1e-3 * scene_extent(cameras)
         _LOG.warning(
             "%s: its cameras are too far from 0 for float32; coordinates are relative to the origin"
             " (%.10g, %.10g, %.10g)%s.",
@@ -100,17 +113,7 @@ class Calibration:
             ValueError: there is no such camera or clip, or no camera is left.
         """
         rest = names_without(path, self.names, sorted({*names} - {*self.unused}))
-        indices = list(map(self.names.index, rest))
-        views = self.test_views
-        return replace(
-            self,
-            **{
-                name: tuple(getattr(self, name)[index] for index in indices)
-                for name in ("cameras", "lenses", "clips")
-            },
-            test_views=views and tuple(indices.index(view) for view in views if view in indices),
-            masks=tuple(self.masks[index] for index in indices if self.masks),
-        )
+        return replace(self, views=tuple(view for view in self.views if view.name in rest))
 
 
 @dataclass(frozen=True)
@@ -256,16 +259,16 @@ def match_clips(
     match = _frames_of_cameras(source, match, poses)
     names = sorted(match.images, key=natural_key)
     images = tuple(tuple(match.images[name]) for name in names)
-    calibration = Calibration(
-        tuple(
-            replace(cameras[index[0]], name=name) for name, index in zip(names, images, strict=True)
-        ),
-        tuple(lenses[index[0]] for index in images),
-        tuple(match.clips[name] for name in names),
-        masks=tuple(masks.get(name, ()) for name in names),
-        unused=unused,
+    views = tuple(
+        CalibratedView(
+            replace(cameras[match.images[name][0]], name=name),
+            lenses[match.images[name][0]],
+            match.clips[name],
+            masks.get(name, ()),
+        )
+        for name in names
     )
-    return calibration, images
+    return Calibration(views, unused=unused), images
 
 
 def _masks(path: Path, cameras: Collection[str]) -> dict[str | None, tuple[Path, ...]]:

@@ -31,10 +31,10 @@ from typing import TypeVar
 
 import imagesize
 
-from morgs_mi.core.checks import composed, few
 from morgs_mi.io.clip_readers import Clip, open_frames
 from morgs_mi.io.listing import VIDEO_SUFFIXES, by_stem, images_in, listed
 from morgs_mi.io.numbering import check_numbering, frame_numbers, natural_key
+from morgs_mi.platform.checks import composed, few
 
 _LOG = logging.getLogger(__name__)
 _Clip = TypeVar("_Clip", Path, tuple[Path])

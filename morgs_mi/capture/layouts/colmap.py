@@ -37,12 +37,12 @@ from morgs_mi.capture.layouts.colmap_files import (
 )
 from morgs_mi.capture.layouts.nerfstudio import read_points_ply
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
-from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import errors_at, few
-from morgs_mi.core.files import atomic_path
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.numbering import natural_key
+from morgs_mi.platform.bounded import check_claim
+from morgs_mi.platform.checks import errors_at, few
+from morgs_mi.platform.files import atomic_path
 
 _LOG = logging.getLogger(__name__)
 

@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.lens import MODELS
-from morgs_mi.core.bounded import read_bytes, regular
+from morgs_mi.platform.bounded import read_bytes, regular
 
 # The records, as in the module's docstring: lines of text, and the formats of `struct`.
 _CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"

@@ -30,12 +30,12 @@ from morgs_mi.capture.layouts.calibration import (
 )
 from morgs_mi.capture.layouts.clips import clip_of_image, size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import read_json, warn_unread
 from morgs_mi.core.camera import Camera, intrinsic_matrix, rigid
-from morgs_mi.core.checks import check_number, errors_at, few, numbers, require
 from morgs_mi.io.clip_readers import Clip
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply import read_vertices
+from morgs_mi.platform.bounded import JsonObject, read_json, warn_unread
+from morgs_mi.platform.checks import check_number, errors_at, few, numbers, require
 
 _LOG = logging.getLogger(__name__)
 
@@ -112,7 +112,7 @@ def _place(name: Any) -> PurePosixPath:
 
 def _number(
     where: str,
-    values: Mapping[str, Any],
+    values: JsonObject,
     key: str,
     default: float | None = None,
     interval: str = "[-1e12, 1e12]",
@@ -122,7 +122,7 @@ def _number(
     return value
 
 
-def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
+def _camera(where: str, values: JsonObject, name: str) -> Camera:
     width = _number(where, values, "w")
     height = _number(where, values, "h")
     fx = _focal_length(where, values, "x", width)
@@ -138,7 +138,7 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
 
 
 def _focal_length(
-    where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None
+    where: str, values: JsonObject, axis: str, size: float, default: float | None = None
 ) -> float:
     """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image
     has `size` px.
@@ -150,7 +150,7 @@ def _focal_length(
     return _number(where, values, key, default)
 
 
-def _lens(where: str, values: Mapping[str, Any]) -> Lens:
+def _lens(where: str, values: JsonObject) -> Lens:
     model = values.get("camera_model", "OPENCV")
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
     if values.get("is_fisheye") or model == "OPENCV_FISHEYE":
@@ -202,7 +202,7 @@ def _sources(path: Path) -> list[Path]:
 
 def _read_meta(
     path: Path, source: Path, clips: Mapping[str, Clip]
-) -> tuple[Mapping[str, Any], list[_View]]:
+) -> tuple[JsonObject, list[_View]]:
     """Return the content of a file, and its entries of `frames`."""
     meta = read_json(source)
     require(
@@ -294,34 +294,35 @@ def _read_calibration(path: Path) -> Calibration:
     training = splits.get("train_filenames", places - held_out)
     # Per camera whether its images are trained on: true, false or both.
     trained = [{views[index].place in training for index in indices} for indices in images]
-    if mixed := [calibration.names[view] for view, kinds in enumerate(trained) if len(kinds) > 1]:
+    kinds_of = dict(zip(calibration.names, trained, strict=True))
+    if mixed := [name for name, kinds in kinds_of.items() if len(kinds) > 1]:
         _LOG.warning(
             "%s: all images of %s are trained on, because the training split has some of them.",
             source,
             few(mixed),
         )
-    test_views = tuple(view for view, kinds in enumerate(trained) if kinds == {False})
+    test = tuple(name for name, kinds in kinds_of.items() if kinds == {False})
     require(
-        len(test_views) < len(images),
+        len(test) < len(images),
         source,
         "the splits must leave a camera to train on",
         "none",
         "add one to the training split",
     )
-    masks = tuple(
-        tuple(sorted({*masks, *(mask for index in indices for mask in views[index].masks)}))
-        for masks, indices in zip(calibration.masks, images, strict=True)
-    )
+    with_masks = []
+    for view, indices in zip(calibration.views, images, strict=True):
+        masks = {*view.masks}.union(*(views[index].masks for index in indices))
+        with_masks.append(replace(view, masks=tuple(sorted(masks))))
     points_file = meta.get("ply_file_path")
     points, colors = (
         read_points_ply(path / _place(points_file)) if points_file else (NO_POINTS, NO_POINTS)
     )
     return replace(
         calibration,
+        views=tuple(with_masks),
         points=points,
         point_colors=colors,
-        masks=masks,
-        test_views=test_views if splits else None,
+        held_out=test if splits else None,
     )
 
 

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import Calibration, Reader, required_clips
+from morgs_mi.capture.layouts.calibration import CalibratedView, Calibration, Reader, required_clips
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.bounded import read_array
 from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at, rigid
-from morgs_mi.core.checks import errors_at
-from morgs_mi.core.files import atomic_path
+from morgs_mi.platform.bounded import read_array
+from morgs_mi.platform.checks import errors_at
+from morgs_mi.platform.files import atomic_path
 
 
 def read_poses_bounds(
@@ -96,7 +96,8 @@ def _read_calibration(path: Path) -> Calibration:
         check_frames(path, by_frame)
         clips = by_frame
     cameras, _ = read_poses_bounds(source, list(clips))
-    return Calibration(cameras, (Lens(),) * len(cameras), tuple(clips.values()))
+    pairs = zip(cameras, clips.values(), strict=True)
+    return Calibration(tuple(CalibratedView(camera, Lens(), clip) for camera, clip in pairs))
 
 
 READER = Reader(

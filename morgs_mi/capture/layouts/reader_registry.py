@@ -12,9 +12,9 @@ from pathlib import Path
 from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
 from morgs_mi.capture.layouts.calibration import Reader, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.extras import extra, places
-from morgs_mi.core.files import CAPTURE, STREAM
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.extras import extra, places
+from morgs_mi.platform.files import CAPTURE, STREAM
 
 READERS: list[Reader] = [
     colmap.READER,

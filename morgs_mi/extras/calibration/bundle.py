@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.core.camera import Camera, pose_at
+from morgs_mi.fit.features import FeatureTracks, intersect
 from morgs_mi.fit.fit_config import CameraPriors
 
 # Number of parameters of a camera's change.
@@ -65,7 +65,7 @@ class _Estimate(NamedTuple):
 
 
 def bundle_adjust(
-    cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray
+    cameras: Sequence[Camera], tracks: FeatureTracks, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the changes [V, 11] of the cameras, and the points [P, 3] in world units, that fit the
     tracks best.
@@ -102,14 +102,14 @@ def bundle_adjust(
     return estimate.changes, estimate.points
 
 
-def _initial_estimate(cameras: Sequence[Camera], tracks: Tracks) -> _Estimate:
+def _initial_estimate(cameras: Sequence[Camera], tracks: FeatureTracks) -> _Estimate:
     """Return the estimate without changes of the cameras."""
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     return _estimate(cameras, tracks, np.zeros((len(cameras), CHANGES)), points)
 
 
 def _estimate(
-    cameras: Sequence[Camera], tracks: Tracks, changes: np.ndarray, points: np.ndarray
+    cameras: Sequence[Camera], tracks: FeatureTracks, changes: np.ndarray, points: np.ndarray
 ) -> _Estimate:
     """Return the estimate with the errors of its projections, which are large behind a camera."""
     errors = np.empty_like(tracks.pixels)
@@ -124,7 +124,7 @@ def _estimate(
 
 
 def likely_deviations(
-    cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray
+    cameras: Sequence[Camera], tracks: FeatureTracks, deviations: np.ndarray
 ) -> np.ndarray:
     """Return the deviations [11] of the errors of calibrated cameras, which are small where
     features reproject well.
@@ -315,7 +315,7 @@ def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
 
 
 def _changed_views(
-    cameras: Sequence[Camera], changes: np.ndarray, tracks: Tracks
+    cameras: Sequence[Camera], changes: np.ndarray, tracks: FeatureTracks
 ) -> Iterator[tuple[np.ndarray, Camera, np.ndarray]]:
     """Yield the mask of the features of each view, its changed camera, and the change [11]."""
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
@@ -323,7 +323,7 @@ def _changed_views(
 
 
 def _equations(
-    cameras: Sequence[Camera], tracks: Tracks, estimate: _Estimate, scale: float
+    cameras: Sequence[Camera], tracks: FeatureTracks, estimate: _Estimate, scale: float
 ) -> NormalEquations:
     """Return the equations of a step of iteratively reweighted least squares, in units of the
     errors' scale.

@@ -33,19 +33,19 @@ from morgs_mi.capture.layouts.clips import (
     photos,
 )
 from morgs_mi.capture.masks import opaque_pixels
-from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames, read_settings
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import few, require, valid_pixels
 from morgs_mi.core.color_space import display_image, display_stops
-from morgs_mi.core.config import check_ranges, config_or_default
-from morgs_mi.core.files import CAPTURE, atomic_path
-from morgs_mi.core.png import png_bytes
-from morgs_mi.core.progress import Report
 from morgs_mi.core.types import Arrays
 from morgs_mi.extras.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck
+from morgs_mi.fit.image_points import MAX_ERROR
 from morgs_mi.io.clip_readers import open_clips
+from morgs_mi.platform.checks import few, require, valid_pixels
+from morgs_mi.platform.config import check_ranges, config_or_default
+from morgs_mi.platform.files import CAPTURE, atomic_path
+from morgs_mi.platform.png import png_bytes
+from morgs_mi.platform.progress import Report
 
 Mapper = Literal["incremental", "global"]
 

@@ -31,14 +31,15 @@ from morgs_mi.cli.settings import (
     options,
 )
 from morgs_mi.cli.streams import opened
-from morgs_mi.core.checks import quantity
-from morgs_mi.core.files import STREAM
-from morgs_mi.core.plots import check_plot
 from morgs_mi.extras.calibration.calibrate import CalibrateConfig
 from morgs_mi.extras.calibration.checks.plots import write_rig
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.extras.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.fit.forecast import forecast
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.files import STREAM
+from morgs_mi.platform.plots import check_plot
+from morgs_mi.playback.streams import SplatFile
 
 # Colours of the verdict on views between the cameras.
 _STYLES = {"good": "green", "fair": "yellow", "poor": "red"}
@@ -100,10 +101,14 @@ class Info:
             if not count:
                 capture = triangulate_points(capture, shared)
                 points += f" ({len(capture.points)} can be triangulated)"
-        train_cameras = [capture.cameras[v] for v in capture.train_views]
+        train_cameras = capture.views.train.cameras
         if len(train_cameras) > 1:
             views = forecast(train_cameras, capture.points)
-            print_result(views.sentence, _STYLES[views.quality])
+            sentence = views.sentence
+            if views.is_wide and rig_check is not None and rig_check.unmatched:
+                sentence = views.unmatched_sentence  # which says all that the check would
+                rig_check = None
+            print_result(sentence, _STYLES[views.quality])
         if rig_check is not None:
             error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
             print_result(
@@ -135,12 +140,16 @@ class Info:
 def _print_stream(path: Path) -> None:
     """Print what a stream, or a file of Gaussians, has in its first frame."""
     stream = opened(path, drop_invalid=False)
-    frames = quantity(len(stream.frame_numbers()), "frame")
+    frames = len(stream.frame_numbers())
     gaussians = next(stream.states()).gaussians
-    memory = sum(value.nbytes for value in gaussians.numpy().values())
-    cameras = quantity(len(stream.cameras), "camera")
-    print_result(f"{stream.path}: {frames} at {stream.fps:g} fps, {cameras}.")
-    print_result(f"{gaussians}, {memory / 1e6:.1f} MB of memory.")
+    print_result(
+        f"{stream.path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}, "
+        f"{'moving' if frames > 1 else 'still'}, {gaussians.size} units, "
+        f"{stream.path.stat().st_size / 1e6:.1f} MB."
+    )
+    if not isinstance(stream, SplatFile):  # which has no time
+        cameras = quantity(len(stream.cameras), "camera")
+        print_result(f"{quantity(frames, 'frame')} at {stream.fps:g} fps, {cameras}.")
     print_next("view", path)
 
 

@@ -40,6 +40,7 @@ from scipy.spatial import KDTree
 from morgs_mi.core.gaussians import ActivatedGaussians, Gaussians
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView, backproject
+from morgs_mi.render.rasterize import render_view
 
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4
@@ -138,7 +139,7 @@ def offset_equations(
     means = np.asarray(gaussians.means, np.float64)[moving]
     products = []
     for view, target in zip(views, targets, strict=True):
-        error = blurred(target.difference(view.render(gaussians, ("color",)).color), blur)
+        error = blurred(target.difference(render_view(gaussians, view).color), blur)
         gradient = image_gradient(blurred(target.image(), blur))
         products.append(gradient_products(gaussians, view, error, gradient))
     A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))

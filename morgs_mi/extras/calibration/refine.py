@@ -30,20 +30,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.features import detect, intersect, join_matches, match_views
 from morgs_mi.capture.lens import Lens, undistorted, undistortion
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import require
-from morgs_mi.core.config import config_or_default
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.progress import Steps
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import scene_extent, seen_points
+from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.bundle import (
     CHANGES,
     NormalEquations,
@@ -60,13 +56,19 @@ from morgs_mi.extras.calibration.offset_equations import (
     image_gradient,
 )
 from morgs_mi.fit.balance import short_fit_config
+from morgs_mi.fit.features import detect, intersect, join_matches, match_views
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
+from morgs_mi.fit.view import LEAST_GAIN, mean_psnr, withheld_blocks
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.ssim import Target
+from morgs_mi.platform.bounded import JsonObject
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.progress import StepReport
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.render_config import RenderConfig
 
 # A camera with features in fewer tracks is not determined by them.
@@ -132,7 +134,7 @@ class Refinement:
 
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         """Return the result with its sentence, and the PSNR of the held-out views, if there are
         any.
 
@@ -146,13 +148,14 @@ class Refinement:
             config: settings of the fit.
         """
         result = {**asdict(self), "sentence": self.sentence}
-        views = [view for v in capture.test_views if (view := _view(capture, frame.images, v))]
+        test = capture.views.at(frame.images).test
+        views = [view for view in test if view.has_image]
         if not views:
             return result
-        extent = scene_extent([capture.cameras[v] for v in capture.train_views])
+        extent = scene_extent(capture.views.train.cameras)
         registered = [
-            view._replace(
-                camera=register_camera(gaussians, view, extent, config.fit, config.render)
+            replace(
+                view, camera=register_camera(gaussians, view, extent, config.fit, config.render)
             )
             for view in views
         ]
@@ -161,18 +164,12 @@ class Refinement:
         return result | {"held_out": scores}
 
 
-def _view(capture: Capture, images: Sequence[np.ndarray | None], view: int) -> View | None:
-    """Return a view of a capture with its image, or None without an image."""
-    if (image := images[view]) is not None:
-        return View(capture.cameras[view], image, capture.masks[view])
-
-
 def refine_cameras(
     capture: Capture,
     config: FitConfig,
     render: RenderConfig | None = None,
     seed: int = 0,
-    progress: Steps | None = None,
+    progress: StepReport | None = None,
 ) -> tuple[Capture, Refinement]:
     """Return the capture with refined training cameras and moved points, if these are better, and
     the result.
@@ -191,21 +188,23 @@ def refine_cameras(
     problem = _Problem.of(capture, config, render, seed)
     deviations = prior_deviations(problem.extent, config.camera_priors)
     bundle_changes, tracks, deviations = _matched(capture, problem.indices, deviations)
-    has_rival = config.refine_cameras == "auto"
-    # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
-    # compared.
-    estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
+    estimates: dict[str, np.ndarray] = {}
+    if config.refine_cameras == "auto":
+        estimates["calibration"] = np.zeros_like(bundle_changes)
+    if tracks:
+        estimates["bundle adjustment"] = bundle_changes
     fits = config.short_fits.rounds + len(estimates) + bool(estimates)
 
     def report(done: int) -> None:
         if progress is not None:
             progress(done, fits)
 
-    estimates.append(problem.refined(bundle_changes, deviations, report))
-    scores = problem.scores(estimates, report) if len(estimates) > 1 else [float("nan")]
-    # The best estimate, apart from the calibrated cameras.
-    best = has_rival + int(np.argmax(scores[has_rival:]))
-    calibrated = scores[0] if has_rival else float("nan")
+    estimates["images"] = problem.refined(bundle_changes, deviations, report)
+    scores = {"images": float("nan")}  # a single estimate is not compared
+    if len(estimates) > 1:
+        scores = dict(zip(estimates, problem.scores([*estimates.values()], report), strict=True))
+    calibrated = scores.pop("calibration", float("nan"))
+    best = max(scores, key=lambda name: scores[name])
     is_better = not scores[best] < calibrated + LEAST_GAIN
     changes = estimates[best]
     refinement = Refinement(
@@ -230,8 +229,8 @@ class _Problem:
     @classmethod
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
-        images = next(capture.displayed().partial_frames(0, 1)).images
-        train = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
+        views = next(capture.displayed().partial_frames(0, 1)).views
+        train = {v: views[v] for v in capture.train_views if views[v].has_image}
         require(
             len(train) > 1,
             "refine_cameras()",
@@ -240,10 +239,10 @@ class _Problem:
             "record more, or set `refine_cameras` to off",
         )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
-        views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
+        visible, withheld = withheld_blocks(list(train.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in train.values()])
         return cls(
-            capture, tuple(train), tuple(views), tuple(withheld_views), extent, config, render, seed
+            capture, tuple(train), tuple(visible), tuple(withheld), extent, config, render, seed
         )
 
     @property
@@ -375,16 +374,15 @@ def _matched(
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
     """Return views with changed cameras, and images and masks without the cameras' distortion."""
     changed_views = []
-    for (camera, image, mask), change in zip(views, changes, strict=True):
-        camera = changed_camera(camera, change)
-        correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
+    for view, change in zip(views, changes, strict=True):
+        view = replace(view, camera=changed_camera(view.camera, change))
+        correction = undistortion(view.camera, Lens("RADIAL", tuple(change[9:])))
         if correction is not None:
             valid = correction.mask
-            if mask is not None:
-                valid = valid & (correction(mask.astype(np.float32)) > _VALID)
-            image = correction(image)
-            mask = valid
-        changed_views.append(View(camera, image, mask))
+            if view.mask is not None:
+                valid = valid & (correction(view.mask.astype(np.float32)) > _VALID)
+            view = replace(view, image=correction(view.image), mask=valid)
+        changed_views.append(view)
     return changed_views
 
 
@@ -463,7 +461,7 @@ def _shifts(
     error.
     """
     view = ActiveView(camera, render)
-    image = view.render(gaussians).color
+    image = render_view(gaussians, view).color
     error = target.difference(image)
     square = max(float(np.mean(error**2)), _LEAST_ERROR)
     # The mean of the rendering and the target, or the rendering where the target is masked.

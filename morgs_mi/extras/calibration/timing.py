@@ -29,18 +29,18 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import require
-from morgs_mi.core.progress import Steps
 from morgs_mi.core.random_streams import Stream, rng_of
+from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.fit.view import View
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.method.ssim import Target
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.progress import StepReport
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.render_config import RenderConfig
 
@@ -91,7 +91,7 @@ class TimeOffsets:
 
 def estimate_time_offsets(
     capture: Capture,
-    progress: Steps | None = None,
+    progress: StepReport | None = None,
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
 
@@ -173,14 +173,14 @@ class _Clips:
     """The first frames of a capture, reduced, and fits to them."""
 
     capture: Capture
-    progress: Steps | None  # called with (fits done, fits at most), or None
+    progress: StepReport | None  # called with (fits done, fits at most), or None
     cameras: tuple[Camera, ...]  # V views
     masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
     images: list[list[np.ndarray]]  # per view and frame uint8 [H, W, 3]
     done: int = 0  # number of completed fits
 
     @classmethod
-    def of(cls, capture: Capture, progress: Steps | None) -> _Clips:
+    def of(cls, capture: Capture, progress: StepReport | None) -> _Clips:
         display = capture.displayed()
         cameras = []
         masks = []

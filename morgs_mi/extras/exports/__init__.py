@@ -1,6 +1,6 @@
 """glTF and OpenUSD files of a stream."""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:

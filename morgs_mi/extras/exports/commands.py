@@ -14,8 +14,8 @@ from morgs_mi.cli.settings import (
     place,
 )
 from morgs_mi.cli.streams import FRAMES, ExportKind, relative_to
-from morgs_mi.core.checks import quantity
-from morgs_mi.core.progress import Report
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.progress import Report
 from morgs_mi.playback.export.formats import GLTF, USD, Format
 
 if TYPE_CHECKING:
@@ -35,11 +35,12 @@ class Gltf(ExportKind):
 
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.codec.frame_source import play
-        from morgs_mi.extras.exports.gltf_export import gltf_axes, write_gltf
+        from morgs_mi.extras.exports.gltf_export import LINEAR, SRGB, gltf_axes, write_gltf
         from morgs_mi.playback.export.clips import select_frames, write_each
 
         frames = select_frames(stream, self.frames)
-        write = partial(write_gltf, axes=gltf_axes(stream.cameras))
+        color_space = LINEAR if "transfer" in stream.metadata else SRGB
+        write = partial(write_gltf, axes=gltf_axes(stream.cameras), color_space=color_space)
         write_each(
             play(stream), output, f".{chosen.name}", write, frames, partial(report, "Writing")
         )

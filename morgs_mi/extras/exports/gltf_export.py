@@ -13,6 +13,11 @@ primitive. Each attribute has its own accessor and buffer view, little-endian fl
 
 glTF's axes have y up. Centres, rotations and spherical harmonics are rotated rather than the node:
 a viewer does not have to rotate the harmonics.
+
+The extension has two colour spaces, sRGB and linear light. Colours above white are encoded by a
+curve that it does not have (see `color_space`), so they are written as linear light: the mean
+colour of a Gaussian exactly, what depends on the direction to first order. Viewers then blend
+linear light, where this package blends encoded colours.
 """
 
 from __future__ import annotations
@@ -20,27 +25,35 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera, unit_vectors
-from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import SH_C0, decode_light
-from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
 from morgs_mi.core.rig import up_direction
 from morgs_mi.core.types import Arrays
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.files import atomic_path
 
 _NAME = "KHR_gaussian_splatting"
+SRGB = "srgb_rec709_display"
+"""The extension's name of encoded colours."""
+LINEAR = "lin_rec709_display"
+"""The extension's name of linear light."""
 _FLOAT = 5126
 _ARRAY_BUFFER = 34962
 _POINTS = 0
+_STEP = 1e-4  # of a derivative, in encoded values
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray) -> None:
+def write_gltf(
+    path: str | Path, gaussians: Gaussians, axes: np.ndarray, color_space: str = SRGB
+) -> None:
     """Write Gaussians as a self-contained .glb file; the file is written atomically.
 
     The extension has no attributes for motion and confidence, which are not written.
@@ -49,17 +62,18 @@ def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray) -> None
         path: the file.
         gaussians: N Gaussians in world axes.
         axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`.
+        color_space: `SRGB`, or `LINEAR` for the Gaussians of a recording in linear light.
 
     Raises:
         ValueError: there is no Gaussian, or there are more than fit into the 4 GiB of a .glb file.
         OSError: the file cannot be written.
     """
-    data = glb(gaussians, axes)
+    data = glb(gaussians, axes, color_space)
     with atomic_path(path, "write_gltf()") as partial:
         partial.write_bytes(data)
 
 
-def glb(gaussians: Gaussians, axes: np.ndarray) -> bytes:
+def glb(gaussians: Gaussians, axes: np.ndarray, color_space: str = SRGB) -> bytes:
     """Return the bytes of the file that `write_gltf` writes.
 
     Raises:
@@ -68,7 +82,9 @@ def glb(gaussians: Gaussians, axes: np.ndarray) -> bytes:
     # An accessor must have at least one element.
     remedy = "glTF cannot hold an empty set"
     require(len(gaussians), "write_gltf()", "at least one Gaussian was expected", "none", remedy)
-    columns = _attributes(rotated(gaussians, axes))
+    if color_space == LINEAR:
+        gaussians = _in_linear_light(gaussians)
+    columns = _attributes(rotated(gaussians, axes), color_space)
     binary = b"".join(column.tobytes() for column in columns.values())
     # Rotation back to the capture's axes: x_world = M x_gltf.
     back = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
@@ -87,7 +103,7 @@ def glb(gaussians: Gaussians, axes: np.ndarray) -> bytes:
     starts = np.cumsum([0, *sizes])
     splats = {
         "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
+        "colorSpace": color_space,
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
@@ -127,12 +143,24 @@ def glb(gaussians: Gaussians, axes: np.ndarray) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, size) + b"".join(chunks)
 
 
-def _attributes(gaussians: Gaussians) -> Arrays:
+def _in_linear_light(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians whose colours are linear light: the mean over all directions exactly, the
+    rest by the slope of the curve there.
+    """
+    mean = 0.5 + SH_C0 * gaussians.numpy()["sh_coeffs"][:, :1].astype(np.float64)
+    slope = (decode_light(mean + _STEP) - decode_light(mean - _STEP)) / (2 * _STEP)
+    coefficients = slope * gaussians.numpy()["sh_coeffs"]
+    coefficients[:, :1] = (decode_light(mean) - 0.5) / SH_C0
+    return replace(gaussians, sh_coeffs=coefficients.astype(np.float32))
+
+
+def _attributes(gaussians: Gaussians, color_space: str) -> Arrays:
     raw = gaussians.numpy()
     alpha = np.clip(np.asarray(gaussians.opacities, np.float32), 0, 1)[:, None]
     coefficients = raw["sh_coeffs"]
-    # Mean colour in linear light.
-    color = decode_light(np.clip(0.5 + SH_C0 * coefficients[:, 0], 0, 1))
+    color = np.clip(0.5 + SH_C0 * coefficients[:, 0], 0, 1)
+    if color_space == SRGB:
+        color = decode_light(color)
     columns = {
         "POSITION": raw["means"],
         f"{_NAME}:ROTATION": np.roll(unit_quats(gaussians), -1, axis=1),

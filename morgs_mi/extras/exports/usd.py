@@ -42,13 +42,13 @@ import numpy as np
 from scipy.special import expit
 
 from morgs_mi.codec.frame_source import FrameSource, FrameState
-from morgs_mi.core.checks import require
-from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
-from morgs_mi.core.progress import Steps
 from morgs_mi.core.types import Arrays
 from morgs_mi.extras.exports.gltf_export import gltf_axes
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.files import atomic_path
+from morgs_mi.platform.progress import StepReport
 from morgs_mi.playback.export.formats import USD, choose_format
 from morgs_mi.playback.stream_header import stream_origin
 
@@ -75,7 +75,7 @@ def write_usd(
     path: str | Path,
     frames: Sequence[int],
     half: bool = False,
-    progress: Steps | None = None,
+    progress: StepReport | None = None,
 ) -> None:
     """Write frames of a stream as an OpenUSD stage; the file is written atomically. See the module
     for its content.
@@ -119,7 +119,7 @@ def _write_stage(
     path: Path,
     frames: Sequence[int],
     half: bool,
-    progress: Steps | None,
+    progress: StepReport | None,
 ) -> None:
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
     axes = gltf_axes(stream.cameras)

@@ -1,6 +1,6 @@
 """Streams from the files of other tools."""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:

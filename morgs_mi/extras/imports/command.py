@@ -15,7 +15,7 @@ from morgs_mi.cli.settings import (
 )
 from morgs_mi.cli.streams import DropInvalid
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.core.checks import quantity
+from morgs_mi.platform.checks import quantity
 from morgs_mi.playback.default_rig import Axes
 
 

@@ -26,16 +26,16 @@ from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number, errors_at, require
-from morgs_mi.core.config import config_or_default
-from morgs_mi.core.files import STREAM, atomic_path
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.progress import Steps
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.numbering import natural_key
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
-from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
+from morgs_mi.platform.checks import check_number, errors_at, require
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.files import STREAM, atomic_path
+from morgs_mi.platform.progress import StepReport
+from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, Axes, default_rig, scene_box
 from morgs_mi.runs.fit_files import due_keyframe
 
 _FRAMES_IN_VIEW = 3  # first, middle and last
@@ -63,7 +63,7 @@ def import_frames(
     fps: float = 30.0,
     config: CodecConfig | None = None,
     axes: Axes = "y-down",
-    progress: Steps | None = None,
+    progress: StepReport | None = None,
     most_invalid: float = 0.0,
 ) -> Imported:
     """Write files with Gaussians, one per frame, as a stream, and return a summary; the stream is
@@ -100,10 +100,16 @@ def import_frames(
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     frames_in_view = [read_splats(paths[t], most_invalid) for t in in_view]
     with errors_at(paths[0].parent):
-        cameras = default_rig(frames_in_view, axes)
+        box = scene_box(frames_in_view)
+        cameras = default_rig(frames_in_view, box, axes)
     del frames_in_view
     path.parent.mkdir(parents=True, exist_ok=True)
-    metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
+    metadata = {
+        "num_frames": len(paths),
+        DEFAULT_RIG: True,
+        BOX: box.tolist(),
+        "config": {"codec": asdict(config)},
+    }
     frames = (read_splats(source, most_invalid) for source in paths)
     report = progress or (lambda *_: None)
     keyframes = 0

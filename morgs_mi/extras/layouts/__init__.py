@@ -1,6 +1,6 @@
 """Further layouts of captures."""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:
@@ -12,5 +12,6 @@ def register() -> None:
             "dynamic3dgs": "dynamic3dgs:READER",
             "qualisys": "qualisys:READER",
             "anipose": "anipose:READER",
+            "easymocap": "easymocap:READER",
         },
     )

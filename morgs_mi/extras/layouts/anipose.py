@@ -29,9 +29,9 @@ from morgs_mi.capture.layouts.calibration import (
     only_calibration,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import MAX_TOML, read_text, read_toml, warn_unread
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import LARGEST, bounded, errors_at, few, require
+from morgs_mi.platform.bounded import MAX_TOML, read_text, read_toml, warn_unread
+from morgs_mi.platform.checks import LARGEST, bounded, errors_at, few, require
 
 _LOG = logging.getLogger(__name__)
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Reader
+from morgs_mi.capture.layouts.calibration import NO_POINTS, CalibratedView, Calibration, Reader
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.bounded import read_array, read_json, warn_unread
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import bounded, errors_at, numbers, require
 from morgs_mi.io.numbering import natural_key
+from morgs_mi.platform.bounded import read_array, read_json, warn_unread
+from morgs_mi.platform.checks import bounded, errors_at, numbers, require
 
 _LOG = logging.getLogger(__name__)
 
@@ -107,17 +107,10 @@ def _read_calibration(path: Path) -> Calibration:
         names = [name for name in names if name not in empty]
     cloud = path / "init_pt_cld.npz"
     points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
-    cameras, clips = zip(*(rig[name] for name in names), strict=True)
-    test_views = tuple(index for index, name in enumerate(names) if name in test)
-    return Calibration(
-        cameras,
-        (Lens(),) * len(names),
-        clips,
-        points,
-        colors,
-        test_views or None,
-        unused=tuple(empty),
-    )
+    pairs = (rig[name] for name in names)
+    views = tuple(CalibratedView(camera, Lens(), clip) for camera, clip in pairs)
+    held_out = tuple(name for name in names if name in test)
+    return Calibration(views, points, colors, held_out or None, unused=tuple(empty))
 
 
 READER = Reader(

@@ -31,9 +31,9 @@ from morgs_mi.capture.layouts.calibration import (
     only_calibration,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import check_claim, read_bytes, warn_unread
 from morgs_mi.core.camera import Camera, pose_at, rigid
-from morgs_mi.core.checks import LARGEST, bounded, errors_at, require
+from morgs_mi.platform.bounded import check_claim, read_bytes, warn_unread
+from morgs_mi.platform.checks import LARGEST, bounded, errors_at, require
 
 _LOG = logging.getLogger(__name__)
 

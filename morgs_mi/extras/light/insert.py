@@ -34,17 +34,25 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from morgs_mi.codec.frame_source import FrameSource, play
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, bounded, check_number, check_type, few, numbers, require
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
-from morgs_mi.core.config import Count, config_class, config_or_default
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
-from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Arrays, Float, UInt32
+from morgs_mi.core.types import Arrays, Float, SceneDict, UInt32, Vector3f
 from morgs_mi.extras.light.light_probe import CLIPPED, check_point, light_probe
-from morgs_mi.extras.synth.scene import build_of, failures_in
 from morgs_mi.gaussian_integrator import ellipsoids
+from morgs_mi.io.scene_file import build_of, failures_in
+from morgs_mi.platform.checks import (
+    LARGEST,
+    bounded,
+    check_number,
+    check_type,
+    few,
+    numbers,
+    require,
+)
+from morgs_mi.platform.config import Count, config_class, config_or_default
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import available_channels
 from morgs_mi.render.channels import channel_sizes
@@ -55,11 +63,13 @@ LAYERS = ("splats", "surfaces", "shadow")
 """Further channels, for compositing: the splats alone and the surfaces alone, in linear light with
 alpha, and the shadow of the surfaces on the splats, a factor of their linear light."""
 
-Light = Literal["probe", "traced"]
+Lighting = Literal["probe", "traced"]
 
-Build = Callable[[int, float], dict[str, Any]]
+Build = Callable[[int, float], SceneDict]
 
 _PLACE = "The inserted scene"  # where its errors begin
+# Gaussians around one that determine the surface it lies on.
+_NEIGHBOURS = 16
 
 
 @config_class
@@ -70,7 +80,7 @@ class InsertConfig:
     """Samples per pixel of its surfaces."""
     shadows: bool = True
     """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
-    light: Light = "probe"
+    light: Lighting = "probe"
     """``probe`` lights the surfaces by an environment map, see `light_probe`; ``traced`` traces
     rays through the Gaussians (`splat_path`), which also throw shadows on them."""
     clipped: float | None = None
@@ -95,7 +105,7 @@ def load_insert(path: str | Path) -> Build:
     )
     if path.suffix == ".xml":
         with _mitsuba_errors_at(path):
-            scene: Any = mi.load_file(str(path))
+            scene: mi.Scene = mi.load_file(str(path))
         entries = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
         # Mitsuba adds an integrator to files without one.
         if ElementTree.parse(path).find("integrator") is not None:
@@ -103,7 +113,7 @@ def load_insert(path: str | Path) -> Build:
         return lambda frame, time: entries
     build = build_of(path, "build(frame, time) -> dict")
 
-    def build_entries(frame: int, time: float) -> dict[str, Any]:
+    def build_entries(frame: int, time: float) -> SceneDict:
         with failures_in(path):
             entries = build(frame, time)
             if not isinstance(entries, dict):
@@ -193,7 +203,7 @@ def render_inserted(
 def _render(
     gaussians: Gaussians,
     camera: Camera,
-    entries: dict[str, Any],
+    entries: SceneDict,
     channels: Sequence[str],
     config: InsertConfig,
 ) -> dict[str, np.ndarray]:
@@ -249,7 +259,7 @@ def _render(
 
 
 def _lit_scenes(
-    entries: dict[str, Any], gaussians: Gaussians, camera: Camera, light: Light, clipped: float
+    entries: SceneDict, gaussians: Gaussians, camera: Camera, light: Lighting, clipped: float
 ) -> tuple[Any, Any]:
     """Return the inserted scene with the lights of its surfaces, and with those that throw shadows
     on the Gaussians.
@@ -257,7 +267,7 @@ def _lit_scenes(
     Raises:
         ValueError: it has no shapes, or they are not finite.
     """
-    scene: Any = mi.load_dict({"type": "scene", **entries})
+    scene: mi.Scene = mi.load_dict({"type": "scene", **entries})
     require(
         scene.shapes() or scene.emitters(), _PLACE, "expected at least one shape", "none", "add one"
     )
@@ -297,17 +307,13 @@ def _mitsuba_errors_at(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {reason}; correct the scene.") from error
 
 
-def _parts(scene: Any) -> list[Any]:
+def _parts(scene: mi.Scene) -> list[Any]:
     """Return the shapes of a scene, and its emitters that are not on one."""
     return [*scene.shapes(), *lights(scene)]
 
 
-# Gaussians around one that determine the surface it lies on.
-_NEIGHBOURS = 16
-
-
 def shadow_ratio(
-    gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples: int = 256
+    gaussians: Gaussians, scene: mi.Scene, viewpoint: ArrayLike, samples: int = 256
 ) -> np.ndarray:
     """Return the ratio of each Gaussian's irradiance with and without a scene's surfaces, float32
     [N] in [0, 1].
@@ -410,7 +416,7 @@ class _Receivers:
         self.normals = dr.unravel(mi.Vector3f, from_numpy(mi.Float, normals))
         self.flat = from_numpy(mi.Float, 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30))
 
-    def response(self, direction: Any) -> Float:
+    def response(self, direction: Vector3f) -> Float:
         """Return the received fraction of light from a direction."""
         return dr.lerp(0.5, dr.maximum(dr.dot(self.normals, direction), 0), self.flat)
 
@@ -427,7 +433,7 @@ def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:
 
 
 def _irradiance(
-    emitter: Any, receivers: _Receivers, blockers: Any, samples: int
+    emitter: mi.Emitter, receivers: _Receivers, blockers: Any, samples: int
 ) -> tuple[Float, Float]:
     """Return the irradiance of one light that surfaces block, and that without surfaces."""
     far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)

@@ -19,11 +19,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number, numbers, require
 from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians
-from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import SceneDict
+from morgs_mi.platform.checks import check_number, numbers, require
 from morgs_mi.render.rasterize import rasterize
 
 CLIPPED = 4.0
@@ -42,7 +43,7 @@ def light_probe(
     background: Sequence[float] | None = None,
     clipped: float = CLIPPED,
     near: float = 0.01,
-) -> dict[str, Any]:
+) -> SceneDict:
     """Return the dictionary of a Mitsuba `envmap` emitter with the light that Gaussians send to a
     point.
 

@@ -28,10 +28,10 @@ import mitsuba as mi
 from annotated_types import Ge
 from mitsuba.ad.integrators import common  # pyright: ignore
 
-from morgs_mi.core.checks import require
-from morgs_mi.core.config import Count, check_value
-from morgs_mi.core.types import Bool, Float
+from morgs_mi.core.types import Bool, Color3f, Float, UInt32
 from morgs_mi.extras.light.light_probe import CLIPPED, radiance
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.config import Count, check_value
 from morgs_mi.surfaces.splat_rays import SplatRays
 
 # Mitsuba reloads this module when one of its own integrators is first used in another variant.
@@ -48,15 +48,15 @@ _PROPERTIES = {
 class _Path:
     """Paths after some segments, the state of the loop."""
 
-    ray: Any  # next segment
-    depth: Any  # number of segments that ended on a surface
-    L: Any  # radiance so far; in the second pass, what is left of it
-    δL: Any  # its derivative
-    β: Any  # throughput
-    η: Any  # ratio of the indices of refraction
-    si: Any  # surface that the next segment leaves
-    pdf: Any  # density of its direction there
-    is_delta: Any  # whether the direction had no choice
+    ray: mi.Ray3f  # next segment
+    depth: UInt32  # number of segments that ended on a surface
+    L: Color3f  # radiance so far; in the second pass, what is left of it
+    δL: Color3f  # its derivative
+    β: Color3f  # throughput
+    η: Float  # ratio of the indices of refraction
+    si: mi.SurfaceInteraction3f  # surface that the next segment leaves
+    pdf: Float  # density of its direction there
+    is_delta: Bool  # whether the direction had no choice
 
 
 class SplatPathIntegrator(common.RBIntegrator):
@@ -96,11 +96,11 @@ class SplatPathIntegrator(common.RBIntegrator):
 
     def sample(
         self,
-        mode: Any,
+        mode: dr.ADMode,
         scene: Any,
-        sampler: Any,
-        ray: Any,
-        δL: Any = None,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        δL: Color3f = None,
         state_in: Any = None,
         active: Bool = True,
         **_: Any,
@@ -117,7 +117,7 @@ class SplatPathIntegrator(common.RBIntegrator):
         ctx = mi.BSDFContext()
         sign = 1 if primal else -1
 
-        def bounce(active: Bool, sampler: Any, path: _Path) -> tuple[Bool, Any, _Path]:
+        def bounce(active: Bool, sampler: mi.Sampler, path: _Path) -> tuple[Bool, Any, _Path]:
             ray = path.ray
             depth = path.depth
             L = path.L
@@ -189,7 +189,7 @@ class SplatPathIntegrator(common.RBIntegrator):
             roulette = depth >= self.rr_depth
             proceed &= (largest > 0) & (~roulette | (sampler.next_1d(proceed) < survival))
             β = dr.select(roulette, β * dr.rcp(survival), β)
-            is_delta: Any = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
+            is_delta: Bool = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
             depth = dr.select(si.is_valid(), depth + 1, depth)
             end = _Path(onwards, depth, L, δL, β, η, dr.detach(si), direction_sample.pdf, is_delta)
             return proceed, sampler, end
@@ -210,7 +210,7 @@ class SplatPathIntegrator(common.RBIntegrator):
         end = dr.while_loop(state, lambda active, *_: active, bounce, label=label)[2]
         return end.L if primal else end.δL, end.depth != 0, [], end.L
 
-    def _layer(self, ray: Any, active: Bool) -> tuple[Any, Float]:
+    def _layer(self, ray: mi.Ray3f, active: Bool) -> tuple[Any, Float]:
         """Return the radiance that the Gaussians on a segment emit, and their transmittance."""
         assert self.splats
         color, transmittance = self.splats.trace(ray, active)
@@ -218,7 +218,7 @@ class SplatPathIntegrator(common.RBIntegrator):
         mean = color * dr.select(alpha > 0, dr.rcp(alpha), 0)
         return alpha * radiance(mean, self.clipped, self.srgb), transmittance
 
-    def _to_light(self, si: Any, ds: Any, active: Bool) -> Float:
+    def _to_light(self, si: mi.SurfaceInteraction3f, ds: Any, active: Bool) -> Float:
         """Return the transmittance between a surface and a sampled light."""
         assert self.splats
         ray = si.spawn_ray_to(ds.p)

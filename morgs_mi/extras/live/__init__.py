@@ -1,6 +1,6 @@
 """Fits of what cameras record at this moment."""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:

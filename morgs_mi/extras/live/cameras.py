@@ -13,8 +13,8 @@ from threading import Condition, Event, Thread
 
 import numpy as np
 
-from morgs_mi.core.checks import require
 from morgs_mi.io.prefetch import close_items
+from morgs_mi.platform.checks import require
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver
 # them in bursts.

@@ -22,9 +22,9 @@ from morgs_mi.cli.settings import (
     options,
     setting,
 )
-from morgs_mi.core.checks import quantity
-from morgs_mi.core.files import STREAM
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.files import STREAM
 
 if TYPE_CHECKING:
     from morgs_mi.extras.live.fit_live import LiveFrame
@@ -68,8 +68,8 @@ class Live:
     arguments: ClassVar[Mapping[str, str]] = {"without": "--exclude", "test_view": "--hold-out"}
 
     def run(self) -> None:
-        from morgs_mi.core.files import PROVISIONAL
         from morgs_mi.extras.live.fit_live import fit_live
+        from morgs_mi.platform.files import PROVISIONAL
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
         config = self.settings.stream_config(LIVE_STREAM)

@@ -26,20 +26,20 @@ from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.config import config_or_default
-from morgs_mi.core.files import CAPTURE, atomic_path, locked_folder, write_json
-from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.png import png_bytes
-from morgs_mi.core.progress import Progress, Report
-from morgs_mi.core.threads import in_background, map_in_threads
-from morgs_mi.extras.calibration.calibrate import calibrate
 from morgs_mi.extras.live.cameras import CameraFeed, FrameSet
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.extras.live.sources import Source, open_feed
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.config import config_or_default
+from morgs_mi.platform.extras import extra
+from morgs_mi.platform.files import CAPTURE, atomic_path, locked_folder, write_json
+from morgs_mi.platform.interrupts import interrupts_raised
+from morgs_mi.platform.png import png_bytes
+from morgs_mi.platform.progress import Progress, Report
+from morgs_mi.platform.threads import in_background, map_in_threads
 from morgs_mi.playback.stream_header import about_lenses
-from morgs_mi.runs.fit_capture import Prepared, push_frame
+from morgs_mi.runs.fit_capture import Prepared, push_frame, with_border
 from morgs_mi.runs.fit_files import (
     FitFiles,
     ProvisionalFrame,
@@ -117,10 +117,10 @@ def fit_live(
                 "path."
             )
         calibration = find_reader(source).read(source)
-        if any(calibration.masks):
+        if any(view.masks for view in calibration.views):
             _LOG.warning("%s: its masks are not used by a live fit.", source)
         calibration = calibration.without(source, live.without)
-    names = calibration and [camera.name for camera in calibration.cameras]
+    names = calibration and calibration.names
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
         report("Waiting for the cameras", 0, 1)
@@ -163,12 +163,13 @@ def begin_capture(
         if calibration is not None:
             write_colmap(
                 folder / "sparse" / "0",
-                calibration.cameras,
+                [view.camera for view in calibration.views],
                 calibration.points,
                 calibration.point_colors,
-                calibration.lenses,
+                [view.lens for view in calibration.views],
             )
         else:
+            calibrate = extra("cameras", "calibrate")
             try:
                 calibrate(folder, progress=on_stage)
             except ValueError as error:
@@ -238,28 +239,26 @@ class _LiveFrames:
         """Return the processed images of a frame set; a camera that has none, or none of its size,
         is logged once.
         """
-        names = self.capture.names
+        views = self.capture.views
         problems: dict[str, str] = {}
-        for k, image in enumerate(frame_set.images):
-            recorded_size = self.capture.recorded_sizes[k]
+        for k, (view, image) in enumerate(zip(views, frame_set.images, strict=True)):
             if image is None:
-                problems[names[k]] = self.feed.problem(k)
-            elif (size := image.shape[1::-1]) != recorded_size:
-                sizes = (*recorded_size, *size)
-                problems[names[k]] = "expected an image of {}x{}, got {}x{}".format(*sizes)
+                problems[view.name] = self.feed.problem(k)
+            elif (size := image.shape[1::-1]) != view.recorded_size:
+                sizes = (*view.recorded_size, *size)
+                problems[view.name] = "expected an image of {}x{}, got {}x{}".format(*sizes)
         for name in problems.keys() - self.missing_names:
             _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
         self.missing_names = set(problems)
 
-        def process(view: int) -> np.ndarray | None:
-            image = frame_set.images[view]
-            if image is None or names[view] in problems:
-                return None
-            return self.capture.process(view, image)
+        def process(k: int) -> np.ndarray | None:
+            image = frame_set.images[k]
+            view = views[k]
+            return None if image is None or view.name in problems else view.process(image)
 
-        images = map_in_threads(process, range(len(frame_set.images)))
+        images = map_in_threads(process, range(len(views)))
         sentences = tuple(f"{name}: {problem}" for name, problem in problems.items())
-        return PartialFrame(frame, tuple(images), sentences)
+        return PartialFrame(frame, views.at(images), sentences)
 
 
 def _fit(
@@ -271,8 +270,9 @@ def _fit(
 ) -> list[LiveFrame]:
     """Fit live frames into a locked folder."""
     capture = frames.capture
-    train = capture.train_views
-    metadata = stream_metadata(capture, next(capture.partial_frames()), config)
+    first_frame = next(capture.partial_frames())
+    config = with_border(capture, first_frame, config)
+    metadata = stream_metadata(capture, first_frame, config)
     del metadata["num_frames"]  # not known yet
     prepared = Prepared.of(capture, config, Progress(on_stage))
     frames.capture = prepared.capture
@@ -286,7 +286,7 @@ def _fit(
             for frame_set, frame in frames:
                 writing_task = in_background(partial(_record, frames, out, frame_set, frame))
                 packet, report = push_frame(
-                    loop, frame, train, None if rows else on_stage, None, provisional.show
+                    loop, frame, None if rows else on_stage, None, provisional.show
                 )
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 writing_task.result()

@@ -9,10 +9,10 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le
 from tyro.conf import arg
 
-from morgs_mi.core.checks import require
-from morgs_mi.core.config import Count, Positive, check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.config import Count, Positive, check_ranges
 
 # Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and
 # nothing should move during the first frame.

@@ -21,12 +21,12 @@ from typing import TypeGuard
 import cv2
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.core.checks import quantity, require
+from morgs_mi.capture.capture import Capture, PartialFrame, RecordedView
 from morgs_mi.extras.live.cameras import CameraFeed
 from morgs_mi.extras.live.live_config import LiveConfig
 from morgs_mi.io.prefetch import close_items, prefetched
 from morgs_mi.io.video import VideoReader
+from morgs_mi.platform.checks import quantity, require
 
 Source = int | str | Path
 """A camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens."""
@@ -127,16 +127,18 @@ def live_frames(
         else:
             streams.append(iter(source))
 
-    def process(view: int, image: np.ndarray) -> np.ndarray:
-        width, height = rig.recorded_sizes[view]
+    def process(view: RecordedView, image: np.ndarray | None) -> np.ndarray | None:
+        if image is None:
+            return None
+        width, height = view.recorded_size
         require(
             image.shape == (height, width, 3) and image.dtype == np.uint8,
             "live_frames()",
-            f"the images of {rig.names[view]} must be uint8 [{height}, {width}, 3] as in its clip",
+            f"the images of {view.name} must be uint8 [{height}, {width}, 3] as in its clip",
             f"{image.dtype} {list(image.shape)}",
             "calibrate at the live size",
         )
-        return rig.process(view, image)
+        return view.process(image)
 
     def frames() -> Iterator[PartialFrame]:
         try:
@@ -147,10 +149,7 @@ def live_frames(
                 pairs = list(zip(rig.names, images, strict=True))
                 yield PartialFrame(
                     index,
-                    tuple(
-                        None if image is None else process(view, image)
-                        for view, image in enumerate(images)
-                    ),
+                    rig.views.at(list(map(process, rig.views, images))),
                     tuple(f"{name}: no image" for name, image in pairs if image is None),
                 )
         finally:

@@ -1,6 +1,6 @@
-"""Networks for flow, masks and LPIPS in ONNX files."""
+"""Networks for flow and masks in ONNX files."""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:
@@ -15,4 +15,3 @@ def register() -> None:
         },
     )
     enter(__name__, "mask refiners", {"sam2:ENCODER.onnx,DECODER.onnx": "sam2:sam2"})
-    enter(__name__, "image distances", {"lpips": "lpips:Lpips"})

@@ -18,10 +18,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import unit_values
-from morgs_mi.extras.networks.onnx_file import OnnxNetwork, written_shapes
+from morgs_mi.io.onnx_file import OnnxNetwork, written_shapes
 from morgs_mi.method.flow_sources.flow_registry import FlowConfig, FlowSource, both_directions
+from morgs_mi.platform.checks import require
 
 # RAFT and similar networks halve the size three times.
 MULTIPLE = 8

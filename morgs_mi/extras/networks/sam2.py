@@ -22,11 +22,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.core.checks import require
-from morgs_mi.core.documentation import page
-from morgs_mi.extras.networks.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
+from morgs_mi.io.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig, MaskRefiner
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.documentation import page
 
 # SAM2's own size, for an encoder that leaves it open.
 _SIZE = 1024

@@ -1,6 +1,6 @@
 """Error of a fit against its run time, and what a scene does not need."""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:

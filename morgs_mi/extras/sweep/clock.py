@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.threads import usable_cores
+from morgs_mi.platform.threads import usable_cores
 
 # Share of the cores that other processes use at most on a machine that counts as quiet.
 _QUIET = 0.1

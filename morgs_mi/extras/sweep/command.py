@@ -65,10 +65,10 @@ class Sweep:
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
-        from morgs_mi.core.bounded import read_json
-        from morgs_mi.core.config import apply_values
-        from morgs_mi.core.plots import check_plot
         from morgs_mi.extras.sweep.sweep import CONFIGS, leave_out, sweep
+        from morgs_mi.platform.bounded import read_json
+        from morgs_mi.platform.config import apply_values
+        from morgs_mi.platform.plots import check_plot
 
         results = self.out / ("leave-out.json" if self.leave_out else "sweep.json")
         check_plot(results.with_suffix(".png"))

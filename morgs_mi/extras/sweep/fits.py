@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from functools import cached_property
 from hashlib import sha256
 from itertools import product
 from operator import itemgetter
@@ -17,18 +17,24 @@ from urllib.parse import quote
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.config import apply_values
-from morgs_mi.core.extras import extra
-from morgs_mi.core.files import locked_folder, write_json
-from morgs_mi.core.progress import Progress, Report
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.results import ViewScores
 from morgs_mi.extras.sweep.clock import Clock, load_average, moment, stopwatch
 from morgs_mi.extras.sweep.statistics import SCORES
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.objective import ObjectiveConfig
-from morgs_mi.runs.fit_capture import begin_as, push_frame, stream_capture, with_points
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.config import apply_values
+from morgs_mi.platform.files import locked_folder, write_json
+from morgs_mi.platform.progress import Progress, Report, name_of
+from morgs_mi.runs.fit_capture import (
+    begin_as,
+    push_frame,
+    stream_capture,
+    with_border,
+    with_points,
+)
 from morgs_mi.runs.fit_files import stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 
@@ -38,6 +44,8 @@ _WARM = {"fit": {"first_frame_steps": 60, "epochs": 2}, "motion": {"mask_interva
 # Digits of the digest in the name of a first frame's folder.
 _DIGEST = 8
 _NO_CLOCK = Clock()
+# Begin and end of the stages of a fit that take long, as shares of it.
+_SPANS = {"First frame": (0.0, 0.5), "Later frames": (0.5, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -73,7 +81,7 @@ class Fits:
 
 
 @dataclass(frozen=True)
-class Fit:
+class StoredFit:
     """A fit that was made, as its folder has it."""
 
     made: Any = None  #: What it was made of: settings, images, the first frame that it continues.
@@ -110,64 +118,7 @@ def fit_arms(
         ValueError: as `stream_capture`, or the network is missing or another one.
         OSError: as `stream_capture`.
     """
-    frame = next(capture.partial_frames(0, 1))
-    call = moment()
-    load = load_average()
-    kind, _, network = measure.partition(":")
-    lpips = extra("image distances", "lpips")(network) if kind == "lpips" else None
-
-    @cache
-    def dense_capture() -> Capture:
-        return with_points(capture, 0, Progress())
-
-    @cache
-    def compile_kernels(config: StreamConfig, frames: int) -> None:
-        loop = StreamLoop.of(dense_capture(), config)
-        for frame in capture.partial_frames(0, min(frames, _WARM_FRAMES)):
-            push_frame(loop, frame, capture.train_views)
-
-    def make_fit(
-        folder: Path, config: StreamConfig, start: Fit | None = None, report: Report | None = None
-    ) -> Fit:
-        """Return a fit, made unless it is in its folder.
-
-        Args:
-            folder: its folder.
-            config: its settings.
-            start: fit of the first frame that it continues; None: it is one.
-            report: called with its progress.
-        """
-        clip = capture if start else replace(capture, num_frames=1)
-        metadata = stream_metadata(clip, frame, config)
-        made = json.loads(json.dumps([metadata, start.clock.date if start else None]))
-        path = folder / "scores.json"
-        fit = stored_fit(path) if path.exists() else Fit()
-        if fit.made != made:
-            compile_kernels(apply_values(replace(config, seed=0), _WARM), clip.num_frames)
-            stop = stopwatch(call, load)
-            if start:
-                begin_as(first_folder(config), folder, clip, metadata)
-            stream_capture(clip, folder, config, start is not None, report)
-            fit = Fit(made, stop())
-        if fit.network != network:
-            fit = replace(fit, network=network, scores=scores_of(folder))
-            write_json(path, asdict(fit))
-        return fit
-
-    def scores_of(folder: Path) -> Sequence[float | None]:
-        result = evaluate_stream(folder, capture.path, lpips=lpips)
-        rows = result.frames[1:] or result.frames
-        scores = asdict(ViewScores.mean([row.scores for row in rows]))
-        scores["first_seconds"] = result.seconds.first
-        scores["seconds"] = result.seconds.per_later_frame
-        scores["kilobytes"] = sum(row.num_bytes for row in rows) / len(rows) / 1e3
-        return itemgetter(*SCORES)(scores)
-
-    def first_folder(config: StreamConfig) -> Path:
-        text = repr(first_frame_config(replace(config, seed=0)))
-        digest = sha256(text.encode()).hexdigest()[:_DIGEST]
-        return out / f"first-frame-{digest}-seed{config.seed}"
-
+    folder = _FitsFolder(capture, out, measure)
     fits = Fits.of(len(arms), seeds)
     total = seeds * len(arms)
     with locked_folder(out, "sweep()"), ExitStack() as at_end:
@@ -176,21 +127,142 @@ def fit_arms(
             arm = arms[k]
             config = replace(arm.config, seed=seed)
             part = progress.part(done, total)
-            fit = make_fit(first_folder(config), first_frame_config(config))
+            report = _report_of(progress, done, total)
+            fit = folder.first_frame(config, report)
             if not arm.first_alone:
                 label = f"{arm.name} epochs{arm.point} seed{seed}".replace(" ", "-")
-                fit = make_fit(out / quote(label, safe=""), config, fit, part.report)
+                fit = folder.continued(fit, label, config, report)
             fits.scores[k, seed] = fit.scores
             fits.calls[k, seed] = fit.clock.call
             fits.clocks.append(fit.clock)
-            if fit.clock.call == call:
+            if fit.clock.call == folder.call:
                 part(1, 1)
                 on_fit(fits)
         progress(total, total)
     return fits
 
 
-def stored_fit(path: Path) -> Fit:
+class _FitsFolder:
+    """The folder of all fits of a capture.
+
+    Args:
+        capture: what is fitted.
+        out: the folder.
+        measure: as of `Vary`.
+    """
+
+    def __init__(self, capture: Capture, out: Path, measure: str) -> None:
+        kind, _, network = measure.partition(":")
+        self.call = moment()
+        self._load = load_average()
+        self._capture = capture
+        self._out = out
+        self._frame = next(capture.partial_frames(0, 1))
+        self._network = network
+        self._lpips = Lpips(network) if kind == "lpips" else None
+        self._compiled: list[tuple[StreamConfig, int]] = []
+
+    def first_frame(self, config: StreamConfig, report: Report) -> StoredFit:
+        """Return the fit of the first frame with some settings."""
+        first_config = first_frame_config(config)
+        capture = replace(self._capture, num_frames=1)
+        return self._fit(self._first_folder(config), capture, first_config, report)
+
+    def continued(
+        self, first: StoredFit, label: str, config: StreamConfig, report: Report
+    ) -> StoredFit:
+        """Return the fit with some settings that continues one of the first frame, in the folder
+        with a name.
+        """
+        folder = self._out / quote(label, safe="")
+        return self._fit(folder, self._capture, config, report, first)
+
+    def _first_folder(self, config: StreamConfig) -> Path:
+        text = repr(first_frame_config(replace(config, seed=0)))
+        digest = sha256(text.encode()).hexdigest()[:_DIGEST]
+        return self._out / f"first-frame-{digest}-seed{config.seed}"
+
+    def _fit(
+        self,
+        folder: Path,
+        capture: Capture,
+        config: StreamConfig,
+        report: Report,
+        first: StoredFit | None = None,
+    ) -> StoredFit:
+        """Return a fit, made unless it is in its folder.
+
+        Args:
+            folder: its folder.
+            capture: the frames that are fitted.
+            config: its settings.
+            report: called with its progress.
+            first: fit of the first frame that it continues; None: it is one.
+        """
+        metadata = stream_metadata(capture, self._frame, with_border(capture, self._frame, config))
+        made = json.loads(json.dumps([metadata, first.clock.date if first else None]))
+        path = folder / "scores.json"
+        fit = stored_fit(path) if path.exists() else StoredFit()
+        if fit.made != made:
+            report("Compiling kernels", 0, 1)
+            self._compile_kernels(config, min(capture.num_frames, _WARM_FRAMES))
+            stop = stopwatch(self.call, self._load)
+            if first:
+                begin_as(self._first_folder(config), folder, capture, metadata)
+            stream_capture(capture, folder, config, first is not None, report)
+            fit = StoredFit(made, stop())
+        if fit.network != self._network:
+            report("Evaluating", 1, 1)
+            fit = replace(fit, network=self._network, scores=self._scores(folder))
+            write_json(path, asdict(fit))
+        return fit
+
+    def _compile_kernels(self, config: StreamConfig, frames: int) -> None:
+        """Fit some frames with few steps, once for all seeds of the same settings."""
+        quick = apply_values(replace(config, seed=0), _WARM)
+        if (quick, frames) in self._compiled:
+            return
+        self._compiled.append((quick, frames))
+        loop = StreamLoop.of(self._dense_capture, quick)
+        for frame in self._capture.partial_frames(0, frames):
+            push_frame(loop, frame)
+
+    @cached_property
+    def _dense_capture(self) -> Capture:
+        """The capture with points of its first images."""
+        return with_points(self._capture, 0, Progress())
+
+    def _scores(self, folder: Path) -> Sequence[float | None]:
+        """Return the scores of the fit in a folder, means over its later frames if it has some."""
+        result = evaluate_stream(folder, self._capture.path, lpips=self._lpips)
+        rows = result.frames[1:] or result.frames
+        scores = asdict(ViewScores.mean([row.scores for row in rows]))
+        scores["first_seconds"] = result.seconds.first
+        scores["seconds"] = result.seconds.per_later_frame
+        scores["kilobytes"] = sum(row.num_bytes for row in rows) / len(rows) / 1e3
+        return itemgetter(*SCORES)(scores)
+
+
+def _report_of(progress: Progress, count: int, total: int) -> Report:
+    """Return the report of one fit, which moves the bar of all fits and names the fit's stage.
+
+    Args:
+        progress: of all fits.
+        count: number of fits before this one.
+        total: number of fits.
+    """
+    share = 0.0
+
+    def report(stage: str, done: float, stage_total: float) -> None:
+        nonlocal share
+        begin, end = _SPANS.get(name_of(stage), (share, share))
+        share = begin + (end - begin) * done / stage_total
+        progress.of(f"{progress.stage}, {stage.lower()}")(count + share, total)
+
+    return report
+
+
+def stored_fit(path: Path) -> StoredFit:
     """Return the fit in the file of its scores.
 
     Raises:
@@ -200,7 +272,7 @@ def stored_fit(path: Path) -> Fit:
         entry = read_json(path)
         clock = Clock(**entry.pop("clock"))
         np.array(entry["scores"], float).reshape(len(SCORES))
-        return Fit(clock=clock, **entry)
+        return StoredFit(clock=clock, **entry)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path}: expected the scores of a fit, got a broken file ({error!r}); remove it, and "

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from morgs_mi.core.plots import label_ends
 from morgs_mi.extras.sweep.report import AXES, select_names
 from morgs_mi.extras.sweep.statistics import DECIDING, INDEX, SCORES, mean_of
+from morgs_mi.extras.sweep.sweep_scores import SweepScores
+from morgs_mi.platform.plots import label_ends
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from morgs_mi.extras.sweep.sweep import SweepResult
 
 # Of Okabe and Ito, which readers with any vision of colours distinguish.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -35,7 +34,7 @@ _LEAST_RATIO = 6.0
 _BARS = 2
 
 
-def draw_sweep(result: SweepResult) -> Figure:
+def draw_sweep(result: SweepScores) -> Figure:
     """Return the plot of a sweep: the measure over the seconds of the first frame, and the scores
     over those of a later frame, a curve for each config.
 
@@ -58,7 +57,7 @@ def draw_sweep(result: SweepResult) -> Figure:
     return figure
 
 
-def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) -> None:
+def draw_curves(axes: Any, result: SweepScores, first_alone: bool, name: str) -> None:
     """Draw a score over seconds, a curve for each config with its name at the end."""
     score = SCORES[name]
     title, _, seconds = AXES[first_alone]
@@ -90,7 +89,7 @@ def draw_curves(axes: Any, result: SweepResult, first_alone: bool, name: str) ->
     label_ends(axes, ends)
 
 
-def draw_changes(result: SweepResult) -> Figure:
+def draw_changes(result: SweepScores) -> Figure:
     """Return the plot of `leave_out`: the changes of the scores without each part; those that
     decide that it is needed have another colour.
 
@@ -125,7 +124,7 @@ def draw_changes(result: SweepResult) -> Figure:
     return figure
 
 
-def _title(result: SweepResult, remark: str) -> str:
+def _title(result: SweepScores, remark: str) -> str:
     """Return the title of a plot: what was fitted, and a remark."""
     views = "held-out" if result.held_out else "training"
     return f"{result.capture}, {views} views, seeds: {result.scores.shape[1]}; {remark}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,7 @@ from morgs_mi.extras.sweep.statistics import (
     level_lines,
     mean_of,
 )
-
-if TYPE_CHECKING:
-    from morgs_mi.extras.sweep.sweep import SweepResult
+from morgs_mi.extras.sweep.sweep_scores import SweepScores
 
 Table = Sequence[Sequence[str]]
 """Rows of a table, the first with the titles of the columns."""
@@ -35,7 +32,7 @@ alone, and of others.
 _SHOWN = ("psnr", "psnr_moving", "motion_error_moving", "kilobytes")
 
 
-def sweep_report(result: SweepResult) -> tuple[dict[str, Table], str]:
+def sweep_report(result: SweepScores) -> tuple[dict[str, Table], str]:
     """Return the tables of a sweep by title, and its sentences: of the first frame alone and of
     later frames, the means, the paired differences, and the seconds for round values.
     """
@@ -62,7 +59,7 @@ def sweep_report(result: SweepResult) -> tuple[dict[str, Table], str]:
     return tables, "\n".join(lines)
 
 
-def leave_out_tables(result: SweepResult) -> dict[str, Table]:
+def leave_out_tables(result: SweepScores) -> dict[str, Table]:
     """Return the table of `leave_out` by its title: the scores with all parts, the changes without
     each, and the reason why a part is needed.
     """
@@ -85,7 +82,7 @@ def leave_out_tables(result: SweepResult) -> dict[str, Table]:
     return {title: _table(heads | columns, rows)}
 
 
-def leave_out_sentence(result: SweepResult, parts: Sequence[str], tolerance: float) -> str:
+def leave_out_sentence(result: SweepScores, parts: Sequence[str], tolerance: float) -> str:
     """Return the sentences of `leave_out`.
 
     Args:
@@ -116,7 +113,7 @@ def ablation_name(parts: Sequence[str]) -> str:
     return f"without {parts[0] if len(parts) == 1 else f'{len(parts)} together'}"
 
 
-def _seconds_text(result: SweepResult, k: int) -> str:
+def _seconds_text(result: SweepScores, k: int) -> str:
     """Return in words how the seconds of a later frame change in an arm."""
     ratio = result.excess[k, DECIDING.index("seconds")]
     if np.isnan(ratio):

@@ -14,6 +14,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+DECIDING = ("psnr", "psnr_moving", "motion_error_moving", "kilobytes", "seconds")
+"""Scores by which a part of the method is needed; seconds are the last."""
+COST_TOLERANCE = 0.05
+"""Share by which seconds, motion error and bytes may grow without a part that is not needed."""
+# Standard errors that a change must exceed.
+_ERRORS = 2
+# Least degrees of freedom of the noise that the seconds of all arms have in common.
+_FREE = 4
+# About as many round values are reported.
+_LEVELS = 4
+
 
 class Score(NamedTuple):
     """A score of a fit."""
@@ -45,18 +56,8 @@ frame. Means over the frames.
 """
 INDEX = {name: k for k, name in enumerate(SCORES)}
 """Their places in an array of scores."""
-DECIDING = ("psnr", "psnr_moving", "motion_error_moving", "kilobytes", "seconds")
-"""Scores by which a part of the method is needed; seconds are the last."""
 DECIDING_INDICES = list(itemgetter(*DECIDING)(INDEX))
 """Their places in an array of scores."""
-COST_TOLERANCE = 0.05
-"""Share by which seconds, motion error and bytes may grow without a part that is not needed."""
-# Standard errors that a change must exceed.
-_ERRORS = 2
-# Least degrees of freedom of the noise that the seconds of all arms have in common.
-_FREE = 4
-# About as many round values are reported.
-_LEVELS = 4
 
 
 class Means(NamedTuple):

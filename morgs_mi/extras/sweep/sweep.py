@@ -13,30 +13,16 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from importlib.util import find_spec
 from io import BytesIO
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.core.config import (
-    Count,
-    NonNegative,
-    apply_values,
-    check_type,
-    check_value,
-    config_or_default,
-)
-from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import write_json
-from morgs_mi.core.interrupts import interrupts_raised
-from morgs_mi.core.plots import check_plot, save_plot
-from morgs_mi.core.progress import Progress, Report
 from morgs_mi.extras.sweep.clock import busy_sentence, moment
 from morgs_mi.extras.sweep.fits import Arm, Fits, first_frame_config, fit_arms
 from morgs_mi.extras.sweep.plot import draw_changes, draw_sweep
@@ -47,9 +33,27 @@ from morgs_mi.extras.sweep.report import (
     leave_out_tables,
     sweep_report,
 )
-from morgs_mi.extras.sweep.statistics import DECIDING, INDEX, SCORES, Means, excess, mean_of
+from morgs_mi.extras.sweep.statistics import DECIDING, INDEX, SCORES, excess
+from morgs_mi.extras.sweep.sweep_scores import SweepScores
 from morgs_mi.extras.sweep.vary import Vary
 from morgs_mi.loop.stream_config import PRESETS, PresetName, StreamConfig
+from morgs_mi.platform.bounded import JsonObject
+from morgs_mi.platform.config import (
+    Count,
+    NonNegative,
+    apply_values,
+    check_type,
+    check_value,
+    config_or_default,
+)
+from morgs_mi.platform.environment import machine, versions
+from morgs_mi.platform.files import write_json
+from morgs_mi.platform.interrupts import interrupts_raised
+from morgs_mi.platform.plots import check_plot, save_plot
+from morgs_mi.platform.progress import Progress, Report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PARTS = {
     "flow guidance": "motion.learn_motion = false",
@@ -70,86 +74,25 @@ the motion starts from zero as well.
 """
 ConfigName = PresetName | Literal["default"]
 """Name of a config: a preset, or the defaults."""
-CONFIGS: Mapping[str, Mapping[str, Any]] = {"default": {}, **PRESETS}
+CONFIGS: Mapping[str, JsonObject] = {"default": {}, **PRESETS}
 """Settings of each."""
 _VARY = Vary()
 _MEASURES = ("psnr", "psnr_moving", "ssim", "motion_error_moving", "lpips")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SweepResult:
+class SweepResult(SweepScores):
     """Scores of fits of a capture by several arms. In a notebook it is tables and a plot.
 
     Attributes:
-        capture: name of the capture.
-        held_out: whether held-out views are scored; otherwise all training views.
-        arms: the A arms.
-        scores: [A, S, N] of S seeds, in the order of `morgs_mi.extras.sweep.statistics.SCORES`; NaN
-            where unknown, or not fitted yet.
-        reference: index of the arm that each arm is compared with [A].
-        measure: name of the score that a sweep compares.
-        excess: of `leave_out`, by how many times losses exceed their bounds [A, D], see
-            `morgs_mi.extras.sweep.statistics.excess`; empty of `sweep`.
         tables: by their titles, lists of rows, the first with the names of the columns.
         sentence: sentences on the result, one a line.
         toml: settings that leave out the parts that the scene does not need, of `leave_out`.
     """
 
-    capture: str
-    held_out: bool
-    arms: Sequence[Arm]
-    scores: np.ndarray
-    reference: np.ndarray
-    measure: str = "psnr"
-    excess: np.ndarray = field(default_factory=partial(np.zeros, (0, len(DECIDING))))
     tables: Mapping[str, Table] = field(default_factory=dict)
     sentence: str = ""
     toml: str = ""
-
-    @property
-    def names(self) -> np.ndarray:
-        """Names of the arms [A]."""
-        return np.array([arm.name for arm in self.arms])
-
-    @property
-    def points(self) -> np.ndarray:
-        """Numbers [A] that are varied along a curve: epochs, or steps of the first frame."""
-        return np.array([arm.point for arm in self.arms])
-
-    @property
-    def changes(self) -> Means:
-        """Means over the seeds of the paired differences from the arms of `reference`."""
-        with np.errstate(invalid="ignore"):
-            return mean_of(self.scores - self.scores[self.reference])
-
-    @property
-    def ablations(self) -> np.ndarray:
-        """Indices of the arms of `leave_out` that lack something and have scores."""
-        is_other = self.reference != np.arange(len(self.reference))
-        return np.flatnonzero(is_other & np.isfinite(self.scores).any((1, 2)))
-
-    @property
-    def reasons(self) -> np.ndarray:
-        """Title of the score [A] because of which what an arm of `leave_out` lacks is needed most;
-        empty if it is not needed.
-        """
-        ratios = np.nan_to_num(self.excess)
-        titles = np.array([SCORES[name].title for name in DECIDING])
-        return np.where(ratios.max(1) > 1, titles[ratios.argmax(1)], "")
-
-    def curves(self, first_alone: bool) -> dict[str, np.ndarray]:
-        """Return the indices of the arms of each curve that have scores, by its name.
-
-        Args:
-            first_alone: whether of fits of the first frame alone.
-        """
-        is_first = np.array([arm.first_alone for arm in self.arms], bool)
-        has_scores = np.isfinite(self.scores).any((1, 2)) & (is_first == first_alone)
-        names = self.names
-        return {
-            name: np.flatnonzero(has_scores & (names == name))
-            for name in dict.fromkeys(names[has_scores].tolist())
-        }
 
     def plot(self, path: str | Path) -> None:
         """Draw the scores over the seconds, a curve for each config; of `leave_out`, the changes
@@ -167,7 +110,7 @@ class SweepResult:
         arms, seeds, _ = self.scores.shape
         return f"SweepResult({self.capture}, {arms} arms, {seeds} seeds)"
 
-    def _figure(self) -> Any:
+    def _figure(self) -> Figure:
         return draw_changes(self) if self.excess.size else draw_sweep(self)
 
     def _repr_html_(self) -> str:
@@ -283,7 +226,7 @@ def _beginning(capture: Capture, frames: int, seeds: int) -> Capture:
     return replace(capture, num_frames=frames)
 
 
-def _reading(capture: Capture) -> dict[str, Any]:
+def _reading(capture: Capture) -> JsonObject:
     """Return how a capture was read, for the JSON of a result."""
     return {
         "num_frames": capture.num_frames,
@@ -336,56 +279,96 @@ def leave_out(
     config = config_or_default("leave_out()", config, StreamConfig())
     check_value("leave_out()", "tolerance", tolerance, NonNegative)
     capture = _beginning(capture, frames, seeds)
-    path = Path(out) / "leave-out.json"
     stage = Progress(progress, "Fitting and evaluating")
-    settings = _reading(capture)
-    settings |= {"tolerance": tolerance, "configs": {"all parts": asdict(config)}}
-    epochs = config.fit.epochs
-    arms: list[Arm] = []
-    reference = np.zeros(0, int)
-    fits = Fits.of(0, seeds)
-
-    def without(parts: Sequence[str]) -> StreamConfig:
-        return apply_values(config, tomllib.loads(_toml(parts)))
-
-    def compare(name: str, others: Sequence[Arm]) -> SweepResult:
-        """Fit all parts, under a name, in turn with other arms; return the result so far."""
-        nonlocal reference
-        earlier = fits
-        new_arms = [Arm(name, config, epochs), *others]
-        reference = np.concatenate([reference, np.full(len(new_arms), len(arms))])
-        arms.extend(new_arms)
-
-        def write(later: Fits) -> SweepResult:
-            nonlocal fits
-            fits = earlier + later
-            held_out = bool(capture.test_views)
-            result = SweepResult(capture.path.name, held_out, arms, fits.scores, reference)
-            ratios = excess(fits.scores, reference, fits.calls, tolerance)
-            result = replace(result, excess=ratios)
-            result = replace(result, tables=leave_out_tables(result))
-            return _write_result(result, path, fits, settings)
-
-        return write(fit_arms(new_arms, capture, seeds, Path(out), "psnr", stage, write))
-
-    parts = [part for part in PARTS if without([part]) != config]
-    single_arms = [Arm(ablation_name([part]), without([part]), epochs) for part in parts]
-    result = compare("all parts", single_arms)
+    trial = _Trial(capture, config, tolerance, seeds, Path(out), stage)
+    parts = [part for part in PARTS if _without([part], config) != config]
+    result = trial.compare("all parts", [[part] for part in parts])
     needed = dict(zip(parts, result.reasons[1:], strict=True))
     losses = dict(zip(parts, result.changes.mean[1:, INDEX["psnr"]], strict=True))
     left_out = [part for part in parts if not needed[part]]
     while len(left_out) > 1:
         # With all parts once more, so that seconds are of fits that ran in turn.
-        arm = Arm(ablation_name(left_out), without(left_out), epochs)
-        result = compare(f"all parts beside {len(left_out)}", [arm])
+        result = trial.compare(f"all parts beside {len(left_out)}", [left_out])
         if not result.reasons[-1]:
             break
         left_out.remove(min(left_out, key=losses.__getitem__))
     toml = _toml(left_out)
     (Path(out) / "leave-out.toml").write_text(toml, encoding="utf-8")
     sentence = leave_out_sentence(result, left_out, tolerance)
-    result = replace(result, sentence=sentence, toml=toml)
-    return _write_result(result, path, fits, settings)
+    return trial.write(replace(result, sentence=sentence, toml=toml))
+
+
+class _Trial:
+    """Fits of a capture with all parts of a method, and without some of them.
+
+    Args:
+        capture: the frames that are fitted.
+        config: settings with all parts.
+        tolerance: as of `leave_out`, like those that follow.
+        seeds: number of seeds.
+        out: folder.
+        progress: of the fits.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        config: StreamConfig,
+        tolerance: float,
+        seeds: int,
+        out: Path,
+        progress: Progress,
+    ) -> None:
+        self._capture = capture
+        self._config = config
+        self._tolerance = tolerance
+        self._seeds = seeds
+        self._out = out
+        self._progress = progress
+        self._arms: list[Arm] = []
+        self._reference = np.zeros(0, int)
+        self._fits = Fits.of(0, seeds)
+
+    def compare(self, name: str, ablations: Sequence[Sequence[str]]) -> SweepResult:
+        """Fit all parts, under a name, in turn with fits that lack some; return the result so
+        far.
+        """
+        config = self._config
+        epochs = config.fit.epochs
+        arms = [Arm(name, config, epochs)]
+        arms += [Arm(ablation_name(parts), _without(parts, config), epochs) for parts in ablations]
+        self._reference = np.append(self._reference, np.full(len(arms), len(self._arms)))
+        self._arms += arms
+        earlier = self._fits
+
+        def write(later: Fits) -> SweepResult:
+            self._fits = earlier + later
+            return self._write_scores()
+
+        # Every round has a bar and a pace of its own.
+        stage = self._progress.of(f"Fitting and evaluating {name}")
+        return write(fit_arms(arms, self._capture, self._seeds, self._out, "psnr", stage, write))
+
+    def _write_scores(self) -> SweepResult:
+        """Write and return the result of the fits so far."""
+        scores = self._fits.scores
+        ratios = excess(scores, self._reference, self._fits.calls, self._tolerance)
+        held_out = bool(self._capture.test_views)
+        name = self._capture.path.name
+        result = SweepResult(name, held_out, self._arms, scores, self._reference, excess=ratios)
+        return self.write(replace(result, tables=leave_out_tables(result)))
+
+    def write(self, result: SweepResult) -> SweepResult:
+        """Write and return a result of the fits so far."""
+        settings = _reading(self._capture)
+        settings |= {"tolerance": self._tolerance}
+        settings |= {"configs": {"all parts": asdict(self._config)}}
+        return _write_result(result, self._out / "leave-out.json", self._fits, settings)
+
+
+def _without(parts: Sequence[str], config: StreamConfig) -> StreamConfig:
+    """Return settings without some parts."""
+    return apply_values(config, tomllib.loads(_toml(parts)))
 
 
 def _toml(parts: Sequence[str]) -> str:
@@ -393,9 +376,7 @@ def _toml(parts: Sequence[str]) -> str:
     return "".join(f"{PARTS[part]}\n" for part in parts)
 
 
-def _write_result(
-    result: SweepResult, path: Path, fits: Fits, settings: Mapping[str, Any]
-) -> SweepResult:
+def _write_result(result: SweepResult, path: Path, fits: Fits, settings: JsonObject) -> SweepResult:
     """Write a result as JSON, and as a plot where matplotlib is installed; return it with a
     sentence on a busy machine.
 

@@ -1,8 +1,10 @@
-"""Synthetic captures: scenes that Mitsuba path-traces, with exact ground truth."""
+"""Synthetic captures: scenes that Mitsuba path-traces, with exact ground truth, and the
+demonstration.
+"""
 
-from morgs_mi.core.extras import enter
+from morgs_mi.platform.extras import enter
 
 
 def register() -> None:
     """Enter what this extra adds to the package."""
-    enter(__name__, "commands", {"synth": "command:Synth"})
+    enter(__name__, "commands", {"synth": "command:Synth", "demo": "demo_command:Demo"})

@@ -13,8 +13,8 @@ from morgs_mi.cli.settings import (
     Flag,
     options,
 )
-from morgs_mi.core.checks import quantity
 from morgs_mi.extras.synth.synth_config import SynthConfig
+from morgs_mi.platform.checks import quantity
 
 
 @options

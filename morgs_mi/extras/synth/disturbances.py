@@ -19,9 +19,9 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.config import NonNegative, check_ranges
-from morgs_mi.core.files import write_json
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.config import NonNegative, check_ranges
+from morgs_mi.platform.files import write_json
 
 _FILE = "disturbances.json"
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from morgs_mi.capture.lens import Lens, undistorted
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import require
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.core.rig import in_image
+from morgs_mi.core.types import SceneDict
 from morgs_mi.extras.synth.ground_truth import SurfacePoints
 from morgs_mi.extras.synth.scene import Pose, Scene
+from morgs_mi.platform.checks import require
 
 # A hit within this share of a point's distance is its own surface: intersections are
 # single-precision.
@@ -66,7 +67,7 @@ class PathTracer:
             ValueError: Mitsuba cannot load it.
         """
         self.scene = scene
-        content: dict[str, Any] = {
+        content: SceneDict = {
             "type": "scene",
             **{name: light.shape for name, light in scene.lights.items()},
         }

@@ -7,22 +7,20 @@ world units.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from traceback import extract_tb
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera, rigid
-from morgs_mi.core.checks import check_type, require
-from morgs_mi.core.documentation import page
+from morgs_mi.core.types import SceneDict
+from morgs_mi.io.scene_file import build_of, failures_in
+from morgs_mi.platform.checks import check_type, require
+from morgs_mi.platform.documentation import page
 
 Pose = Callable[[float], np.ndarray]
 
@@ -31,7 +29,7 @@ Pose = Callable[[float], np.ndarray]
 class Object:
     """A rigid object."""
 
-    shapes: Mapping[str, dict[str, Any]]  #: Mitsuba shape dictionaries by name, in object space.
+    shapes: Mapping[str, SceneDict]  #: Mitsuba shape dictionaries by name, in object space.
     #: Seconds -> rigid object-to-world matrix [4, 4]; None for a static object, in world space.
     pose: Pose | None = None
 
@@ -41,7 +39,7 @@ class Light:
     """A lamp. It has no id in the ground truth, so it must not be visible."""
 
     #: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
-    shape: dict[str, Any]
+    shape: SceneDict
     #: Seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
     pose: Pose | None = None
 
@@ -125,48 +123,6 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         result = build(seed)
     check_type("load_scene()", f"build(seed) of {path}", result, Scene, "return Scene(...)")
     return result
-
-
-def build_of(path: Path, expected: str) -> Callable[..., Any]:
-    """Return the function `build` of a Python file, after running it.
-
-    Raises:
-        ValueError: it has none with the signature `expected`, or it fails.
-    """
-    spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look up the names of their postponed annotations in `sys.modules`.
-    sys.modules[spec.name] = module
-    with failures_in(path):
-        spec.loader.exec_module(module)
-    build: Any = getattr(module, "build", None)
-    require(callable(build), path, f"it must define `{expected}`", "none", "add that function")
-    return build
-
-
-@contextmanager
-def failures_in(path: Path) -> Iterator[None]:
-    """Raise `ValueError` with the line of the file at `path` for any error of the code in it."""
-    try:
-        yield
-    except Exception as error:
-        if isinstance(error, SyntaxError):  # which has no frame in the file
-            line = error.lineno
-            reason = error.msg
-        else:
-            # The file name of a frame is absolute.
-            frames = extract_tb(error.__traceback__)
-            file = path.resolve()
-            lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file]
-            line = lines[-1] if lines else None
-            reason = str(error)
-        place = f"{path}, line {line}" if line else str(path)
-        kind = type(error).__name__
-        raise ValueError(
-            f"{place}: {kind}: {reason.rstrip('.')}; correct the scene file."
-        ) from error
 
 
 def check_scene(scene: Scene, times: Sequence[float]) -> None:

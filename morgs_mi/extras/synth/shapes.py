@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.types import SceneDict
 from morgs_mi.extras.synth.scene import rotate, translate
 
-Material = dict[str, Any]
+Material = SceneDict
 
 
-def ball(radius: float, material: Material, center: Sequence[float] = (0, 0, 0)) -> dict[str, Any]:
+def ball(radius: float, material: Material, center: Sequence[float] = (0, 0, 0)) -> SceneDict:
     """Return a sphere."""
     placement = {} if tuple(center) == (0, 0, 0) else {"center": list(center)}
     return {"type": "sphere", **placement, "radius": radius, "bsdf": material}
 
 
-def box(center: Sequence[float], half: Sequence[float], material: Material) -> dict[str, Any]:
+def box(center: Sequence[float], half: Sequence[float], material: Material) -> SceneDict:
     """Return a box with half-widths `half` along the axes."""
     return {
         "type": "cube",
@@ -30,7 +30,7 @@ def box(center: Sequence[float], half: Sequence[float], material: Material) -> d
 
 def rod(
     start: Sequence[float], end: Sequence[float], radius: float, material: Material
-) -> dict[str, Any]:
+) -> SceneDict:
     """Return a cylinder that is open at both ends."""
     return {
         "type": "cylinder",
@@ -41,7 +41,7 @@ def rod(
     }
 
 
-def disk(center: Sequence[float], radius: float, material: Material) -> dict[str, Any]:
+def disk(center: Sequence[float], radius: float, material: Material) -> SceneDict:
     """Return a disk that faces up."""
     facing_up = translate(*center) @ rotate("x", -np.pi / 2) @ np.diag([radius, radius, 1, 1])
     return {"type": "disk", "to_world": mi.ScalarTransform4f(facing_up), "bsdf": material}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 
-from morgs_mi.core.config import Count, NonNegativeInt
-from morgs_mi.core.documentation import documented
 from morgs_mi.extras.synth.disturbances import Disturbances
+from morgs_mi.platform.bounded import JsonObject
+from morgs_mi.platform.config import Count, NonNegativeInt
+from morgs_mi.platform.documentation import documented
 
 if TYPE_CHECKING:
     from morgs_mi.extras.synth.scene import RecordingDefaults
@@ -55,7 +56,7 @@ class SynthConfig:
             noise=recording.noise if self.noise is None else self.noise,
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return the settings as stored in `capture.json`."""
         values = asdict(self)
         return {"num_cameras": values.pop("cameras"), "num_frames": values.pop("frames"), **values}

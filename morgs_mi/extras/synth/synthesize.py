@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -22,13 +21,7 @@ from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
-from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import require
-from morgs_mi.core.config import check_ranges, config_or_default
-from morgs_mi.core.files import CAPTURE, atomic_path, write_json
-from morgs_mi.core.memory import check_memory
-from morgs_mi.core.progress import Steps
 from morgs_mi.extras.synth.disturbances import (
     CameraDisturbance,
     draw_disturbances,
@@ -44,6 +37,12 @@ from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.io.listing import is_added
 from morgs_mi.io.video_writer import H264, write_video
+from morgs_mi.platform.bounded import JsonObject, read_json
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.config import check_ranges, config_or_default
+from morgs_mi.platform.files import CAPTURE, atomic_path, write_json
+from morgs_mi.platform.memory import check_memory
+from morgs_mi.platform.progress import StepReport
 
 _LOG = logging.getLogger(__name__)
 # Bytes of a pixel of an image with its ground truth.
@@ -61,7 +60,7 @@ def synthesize(
     config: SynthConfig | None = None,
     *,
     overwrite: bool = False,
-    progress: Steps | None = None,
+    progress: StepReport | None = None,
 ) -> Path:
     """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground
     truth.
@@ -214,7 +213,9 @@ def _record_light(
     return np.concatenate(bands)
 
 
-def _write_clips(tracer: PathTracer, rig: _Rig, folder: Path, progress: Steps | None) -> list[Path]:
+def _write_clips(
+    tracer: PathTracer, rig: _Rig, folder: Path, progress: StepReport | None
+) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
     config = rig.config
     noise = config.noise
@@ -367,7 +368,7 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     )
 
 
-def stored_settings(folder: Path) -> dict[str, Any]:
+def stored_settings(folder: Path) -> JsonObject:
     """Return the content of a folder's `capture.json`; empty if there is none, or a broken one."""
     try:
         settings = read_json(folder / CAPTURE)

@@ -12,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.types import SceneDict
 from morgs_mi.extras.synth.scene import Light, Object
 
 RGB = tuple[float, float, float]
@@ -48,7 +49,7 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np
 
 def textured(
     texture: np.ndarray, roughness: float | None = None, repeat: tuple[float, float] = (1, 1)
-) -> dict[str, Any]:
+) -> SceneDict:
     """Return a textured Mitsuba material, diffuse or rough plastic.
 
     Args:

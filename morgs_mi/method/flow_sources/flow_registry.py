@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morgs_mi.core.config import NonNegative, NonNegativeInt, config_class
 from morgs_mi.method.method_registry import Registry
+from morgs_mi.platform.config import NonNegative, NonNegativeInt, config_class
 
 
 @config_class

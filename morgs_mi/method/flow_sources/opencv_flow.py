@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
-from morgs_mi.core.config import config_or_default
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
     FlowConfig,
     both_directions,
 )
+from morgs_mi.platform.config import config_or_default
 
 # Side of an image in pixels below which the methods have too little to match: DIS needs patches of
 # 8 pixels on its coarsest level.

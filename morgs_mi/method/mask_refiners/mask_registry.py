@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from morgs_mi.core.config import Count, NonNegative, config_class
 from morgs_mi.method.method_registry import Registry
+from morgs_mi.platform.config import Count, NonNegative, config_class
 
 
 @config_class
@@ -32,11 +32,8 @@ class MaskConfig:
     """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
     proportional to the width, as the motion of a scene is."""
     working_width: Count = 320
-    """Width in pixels to which GrabCut and superpixels reduce an image. Their cost grows with the
-    number of pixels, and a mask needs the object's outline, not its details."""
-    superpixel_share: NonNegative = 0.75
-    """Share of a superpixel that must lie in the flow mask. Flow bleeds outwards onto the static
-    surroundings of an object, all of which a bare majority would include."""
+    """Width in pixels to which GrabCut reduces an image. Its cost grows with the number of pixels,
+    and a mask needs the object's outline, not its details."""
     prompts: Count = 16
     """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
     of the decoder; the smaller ones stay as they are in the flow mask."""

@@ -1,4 +1,4 @@
-"""Motion masks refined by colours: GrabCut and superpixels of OpenCV."""
+"""Motion masks refined by colours: GrabCut of OpenCV."""
 
 from __future__ import annotations
 
@@ -19,11 +19,6 @@ _ITERATIONS = 2
 _REACH = 0.05
 # Share of the image above which GrabCut is skipped: the rest has too few colours to learn from.
 _COVERAGE = 0.9
-# Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of
-# distance against colour.
-_SIDE = 8
-_SLIC_ITERATIONS = 5
-_COMPACTNESS = 10.0
 
 
 def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.ndarray:
@@ -60,32 +55,6 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.n
     return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 
-def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.ndarray:
-    """Return the mask of the superpixels [H, W] bool three quarters of which are in a motion mask.
-
-    SLIC (Achanta et al., PAMI 2012) on colours in Lab. Flow that bleeds over an edge is removed,
-    and so is any part of the mask thinner than a superpixel, 8 pixels in an image 320 wide. An
-    image with a side under two superpixels has none (OpenCV crashes with a segmentation fault below
-    one): its mask is returned unchanged.
-
-    Args:
-        image: [H, W, 3], RGB, uint8 or float in [0, 1].
-        mask: [H, W] bool.
-        config: settings of the superpixels.
-    """
-    small = thumbnail(byte_values(image), config.working_width)
-    if min(small.shape[:2]) < 2 * _SIDE:
-        return mask
-    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, _SIDE, _COMPACTNESS)
-    slic.iterate(_SLIC_ITERATIONS)
-    slic.enforceLabelConnectivity()
-    labels = np.asarray(slic.getLabels(), np.int32)
-    votes = cv2.resize(mask.astype(np.float32), labels.shape[::-1], interpolation=cv2.INTER_AREA)
-    shares = np.bincount(labels.ravel(), votes.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)
-    return _enlarged(shares[labels] >= config.superpixel_share, mask.shape)
-
-
 def clean_mask(mask: np.ndarray) -> np.ndarray:
     """Return a mask [H, W] bool with its specks removed and its holes closed.
 
@@ -100,11 +69,6 @@ def clean_mask(mask: np.ndarray) -> np.ndarray:
 
 MASK_REFINERS.register("grabcut")(
     lambda argument, config: lambda image, mask: mask | refine_mask(image, mask, config)
-)
-MASK_REFINERS.register("superpixels+grabcut")(
-    lambda argument, config: (
-        lambda image, mask: vote_superpixels(image, mask, config) | refine_mask(image, mask, config)
-    )
 )
 
 

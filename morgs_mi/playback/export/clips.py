@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource, FrameState, play
-from morgs_mi.core.checks import check_number
-from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.progress import Steps
 from morgs_mi.core.rig import moved
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
+from morgs_mi.platform.checks import check_number
+from morgs_mi.platform.files import atomic_folder, atomic_path
+from morgs_mi.platform.progress import StepReport
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.formats import Format
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
@@ -123,7 +123,7 @@ def write_ply_files(
     output: str | Path,
     kind: Format,
     frames: Sequence[int],
-    progress: Steps,
+    progress: StepReport,
 ) -> None:
     """Write frames of a stream as PLY files of a format in `PLY`, see `write_each`."""
     is_compressed = kind.name == "compressed.ply"
@@ -138,7 +138,7 @@ def write_each(
     suffix: str,
     write: Callable[[Path, Gaussians], None],
     frames: Sequence[int],
-    progress: Steps,
+    progress: StepReport,
 ) -> None:
     """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file;
     atomically.

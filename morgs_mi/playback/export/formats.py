@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.core.files import STREAM
+from morgs_mi.platform.files import STREAM
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ GLTF = (Format("glb", "gltf", folder=True),)
 USD = tuple(Format(name, f"stream.{name}") for name in ("usdc", "usd", "usda", "usdz"))
 VIDEO = (Format("mp4", "{}.mp4"), Format("webm", "{}.webm"))
 WEB = (Format("html", "player.html"), Format("", "web", folder=True))
+SHEET = (Format("png", "{}.png"),)
 IMAGES = (
     *VIDEO,
     Format("exr", "{}-exr", folder=True, ending="exr"),

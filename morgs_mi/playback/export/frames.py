@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.core.color_space import decode_light, exposed
-from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import H264, VP9, write_video
+from morgs_mi.platform.files import atomic_folder, atomic_path
+from morgs_mi.platform.png import png_bytes
 from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import explained_image
 from morgs_mi.playback.visualise import side_by_side, to_uint8, write_png
@@ -122,4 +122,6 @@ def pad_to_even(image: np.ndarray) -> np.ndarray:
 
 
 def _combined_image(images: Arrays) -> np.ndarray:
-    return side_by_side([explained_image(name, image) for name, image in images.items()])
+    return side_by_side(
+        [explained_image(name, image, color=images.get("color")) for name, image in images.items()]
+    )

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import (
     Camera,
     intrinsic_matrix,
@@ -25,9 +24,10 @@ from morgs_mi.core.camera import (
     pose_at,
     rigid,
 )
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.rig import focus_point, positions_of, up_direction
 from morgs_mi.io.listing import existing_file
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.checks import check_number
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

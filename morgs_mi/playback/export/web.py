@@ -12,35 +12,41 @@ import base64
 import gzip
 import html
 import io
+import json
 import re
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 
-from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.container import StreamWriter, header_json
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER
-from morgs_mi.core.files import STREAM, atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.png import jpeg_bytes
 from morgs_mi.core.rig import seen_points
-from morgs_mi.playback.default_rig import DEFAULT_RIG
+from morgs_mi.platform.bounded import JsonObject
+from morgs_mi.platform.files import STREAM, atomic_folder, atomic_path
+from morgs_mi.platform.png import jpeg_bytes
+from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, box_corners
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import MOTION_SCALE, picture
 from morgs_mi.playback.stream_header import (
+    between_cameras,
     metadata_entry,
+    num_frames,
+    render_config,
+    stream_box,
     stream_exposure,
     stream_name,
     stream_origin,
 )
 
-Progress = Callable[[int], None]
+ImageReport = Callable[[int], None]
 
 # What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
 _UNSAFE = (0x00, 0x0D, 0x3C)
@@ -53,7 +59,8 @@ _SAMPLES = 500
 _LEAST_SCALE = 0.001
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
 LARGEST = 4_000_000
-_POSTER_WIDTH = 640  # pixels of the image until the first frame is shown
+_LEAST_LOGIT = -2.0  # of the opacity of what the page frames, as `seen` in web/src/mesh.ts
+_POSTER_WIDTH = 960  # pixels of the image until the first frame is shown
 # Width and height of the player in pixels, unless the output of the cell is narrower.
 _WIDTH = 800
 _HEIGHT = 600
@@ -69,7 +76,7 @@ def write_web_page(
     stream: FrameSource,
     path: str | Path,
     title: str | None = None,
-    progress: Progress | None = None,
+    progress: ImageReport | None = None,
 ) -> int:
     """Write a self-contained page that plays a stream, and return its number of bytes.
 
@@ -93,18 +100,18 @@ def write_web_page(
 
 
 def web_page(
-    stream: FrameSource, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource, title: str | None = None, progress: ImageReport | None = None
 ) -> bytes:
     """Return the page that `write_web_page` writes; arguments and errors are the same."""
     data = _script("stream", published_bytes(stream, progress))
-    return _page(title or stream_name(stream), data, "data: blob:", first_image(stream))
+    return _page(stream, title, data, "data: blob:")
 
 
 def write_web_folder(
     stream: FrameSource,
     path: str | Path,
     title: str | None = None,
-    progress: Progress | None = None,
+    progress: ImageReport | None = None,
 ) -> int:
     """Write a folder for a web server and return its number of bytes.
 
@@ -123,7 +130,7 @@ def write_web_folder(
         OSError: the folder cannot be written.
     """
     data = published_bytes(stream, progress)
-    page = served_page(title or stream_name(stream), image=first_image(stream))
+    page = served_page(stream, title)
     contents = {"index.html": page, STREAM: data, _MODULE: (_FOLDER / _MODULE).read_bytes()}
     with atomic_folder(path, "write_web_folder()") as partial:
         for name, content in contents.items():
@@ -158,24 +165,90 @@ def stream_html(stream: FrameSource) -> str:
 def first_image(stream: FrameSource) -> str:
     """Return the first frame of a stream, from its first camera, as the address of a JPEG."""
     gaussians = next(gaussians for _, gaussians in play(stream))
+    image = base64.b64encode(jpeg_bytes(picture(stream, gaussians, _poster_camera(stream))))
+    return f"data:image/jpeg;base64,{image.decode()}"
+
+
+def _poster_camera(stream: FrameSource) -> Camera:
     camera = stream.cameras[0]
-    camera = camera.with_width(min(_POSTER_WIDTH, camera.width))
-    image = base64.b64encode(jpeg_bytes(picture(stream, gaussians, camera))).decode()
-    return f"data:image/jpeg;base64,{image}"
+    return camera.with_width(min(_POSTER_WIDTH, camera.width))
 
 
-def served_page(title: str, server: str | None = None, image: str = "data:,") -> bytes:
+def _exact_image(stream: FrameSource, frame: int) -> str:
+    """Return the address at which a server of `playback.viewer` renders a frame from the first
+    camera.
+    """
+    header = header_json([_poster_camera(stream)], stream.fps, {})
+    camera = json.dumps(json.loads(header)["cameras"][0])
+    return html.escape(f"exact/{frame}/color?{urlencode({'camera': camera, 'scale': 1})}")
+
+
+def served_page(
+    stream: FrameSource,
+    title: str | None = None,
+    server: str = "none",
+    poster: int | None = None,
+) -> bytes:
     """Return the page for a server that has the stream as a file.
 
     Args:
-        title: its title.
+        stream: the file.
+        title: its title; by default the name of the stream's folder or file.
         server: for the server of `playback.viewer`: ``recorded`` if it has recorded images, or
-            empty; None for any other.
-        image: address of an image until the first frame is shown.
+            ``exact``; ``none`` for any other.
+        poster: frame that such a server renders until the page draws its first one; None: it has
+            no frame yet.
     """
-    attribute = "" if server is None else f' data-server="{server}"'
-    place = f'<i id="stream" data-address="{STREAM}"{attribute} hidden></i>'
-    return _page(title, place, "'self' data: blob:", image)
+    place = f'<i id="stream" data-address="{STREAM}" hidden></i>'
+    return _page(stream, title, place, "'self' data: blob:", server, poster)
+
+
+def _first_paint(stream: FrameSource, server: str, poster: int | None) -> dict[str, str]:
+    """Return what the page shows before its script runs, so that nothing moves then: what decides
+    the controls, the colour behind everything, and the first frame where the first camera will be.
+    A server of `playback.viewer` may have no frame yet.
+    """
+    camera = stream.cameras[0]
+    corners = np.array([[0, 0], camera.size])
+    if stream.metadata.get(BOX) is not None:
+        corners, _ = camera.project(box_corners(stream_box(stream)))
+    x, y = corners.min(axis=0)
+    width, height = np.ptp(corners, axis=0)
+    image = "data:,"
+    motion = camera.width / 2
+    frames = num_frames(stream)
+    if server == "none":
+        image = first_image(stream)
+        motion = _motion_place(next(gaussians for _, gaussians in play(stream)), camera)
+        frames = len(stream.frame_numbers())
+    elif poster is not None and camera.background is None:  # the server renders over colours alone
+        image = _exact_image(stream, poster)
+    recorded = json.dumps(stream.metadata.get(DEFAULT_RIG) is not True)
+    red, green, blue = render_config(stream).background or (0, 0, 0)
+    between = html.escape(between_cameras(stream))
+    return {
+        "{kind}": (
+            f'data-frames="{frames}" data-recorded="{recorded}" data-server="{server}" '
+            f'data-between="{between}"'
+        ),
+        "{ground}": f"rgb({red:.1%} {green:.1%} {blue:.1%})",
+        "{frame}": (
+            f"--image-width: {camera.width}; --image-height: {camera.height}; --x: {x:.6g}; "
+            f"--y: {y:.6g}; --width: {width:.6g}; --height: {height:.6g}; --motion: {motion:.6g}"
+        ),
+        "{image}": image,
+    }
+
+
+def _motion_place(gaussians: Gaussians, camera: Camera) -> float:
+    """Return the median column of what is likely to move in the image of a camera; of an image
+    without such, its middle.
+    """
+    raw = gaussians.numpy()
+    moves = raw["logit_opacities"] > _LEAST_LOGIT
+    moves &= raw.get("logit_confidence", np.zeros(1)) > 0
+    _, pixels, _ = seen_points(camera, raw["means"][moves])
+    return float(np.median(pixels[:, 0])) if len(pixels) else camera.width / 2
 
 
 def text_of_bytes(data: bytes) -> str:
@@ -192,7 +265,7 @@ def text_of_bytes(data: bytes) -> str:
     return (codes + np.uint8(128) * np.isin(codes, _UNSAFE)).tobytes().decode("latin-1")
 
 
-def published_bytes(stream: FrameSource, progress: Progress | None = None) -> bytes:
+def published_bytes(stream: FrameSource, progress: ImageReport | None = None) -> bytes:
     """Return the stream with the metadata that the page reads, after decoding it once; errors as
     `write_web_page`.
     """
@@ -209,11 +282,12 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
         # Not the maximum: a few Gaussians that the fit has lost are several times as fast as the
         # scene.
         scale = np.percentile(speeds, 99, weights=weights, method="inverted_cdf")
-    metadata: dict[str, Any] = {
+    metadata: JsonObject = {
         "config": {"render": metadata_entry(stream, "config.render", {}, dict)},
         "motion_scale": max(_LEAST_SCALE, float(scale)),
         "origin": stream_origin(stream).tolist(),
         DEFAULT_RIG: stream.metadata.get(DEFAULT_RIG) is True,
+        BOX: stream.metadata.get(BOX),
     }
     if stops := stream_exposure(stream):
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
@@ -249,14 +323,21 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     return np.hstack(views)
 
 
-def _page(title: str, data: str, connect: str, image: str) -> bytes:
+def _page(
+    stream: FrameSource,
+    title: str | None,
+    data: str,
+    connect: str,
+    server: str = "none",
+    poster: int | None = None,
+) -> bytes:
     code = gzip.compress((_FOLDER / "player.js").read_bytes(), 9, mtime=0)
     page = (_FOLDER / "player.html").read_text(encoding="utf-8")
     values = {
         "{version}": version("morgs-mi"),
         "{connect}": connect,
-        "{title}": html.escape(title),
-        "{image}": image,
+        "{title}": html.escape(title or stream_name(stream)),
+        **_first_paint(stream, server, poster),
         "{notice}": (_FOLDER / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }

@@ -16,9 +16,9 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import LARGEST, check_number, require
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.png import png_bytes
+from morgs_mi.platform.checks import LARGEST, check_number, require
+from morgs_mi.platform.png import png_bytes
 from morgs_mi.playback.player import available_channels, picture
 from morgs_mi.playback.stream_header import (
     fitted_capture,

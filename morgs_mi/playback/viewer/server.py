@@ -16,6 +16,7 @@ import re
 import secrets
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,11 +32,10 @@ from starlette.routing import Route
 from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE, camera_of_fields, load_json
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.bounded import open_regular
-from morgs_mi.core.files import PROVISIONAL, STREAM
-from morgs_mi.core.png import jpeg_bytes
+from morgs_mi.platform.bounded import open_regular
+from morgs_mi.platform.files import PROVISIONAL, STREAM
+from morgs_mi.platform.png import jpeg_bytes
 from morgs_mi.playback.export.web import published_bytes, served_page
-from morgs_mi.playback.stream_header import stream_name
 from morgs_mi.playback.streams import SplatFile
 from morgs_mi.playback.viewer.access import MOST, Access, Connection, log_limit_once
 from morgs_mi.playback.viewer.images import ExactImages, RecordedImages
@@ -150,8 +150,11 @@ class Viewer:
         )
 
     def _send_page(self, _: Request) -> Response:
-        server = "recorded" if self._recorded.are_present(self._stream) else ""
-        return HTMLResponse(served_page(stream_name(self._stream), server))
+        server = "recorded" if self._recorded.are_present(self._stream) else "exact"
+        first_frame = None
+        with suppress(OSError, ValueError):  # the page itself describes what is wrong with the file
+            first_frame = next(iter(self._opened().frame_numbers()), None)
+        return HTMLResponse(served_page(self._stream, server=server, poster=first_frame))
 
     def _send_stream(self, request: Request) -> Response:
         return _stream_response(self._newest(), request)

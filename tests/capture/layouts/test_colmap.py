@@ -12,7 +12,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import find_models, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.testing import assert_close
-from tests.core.test_files import tree
+from tests.platform.test_files import tree
 from tests.scenes.captures import HEIGHT, WIDTH, rig, videos
 from tests.scenes.full_disk import files_end_at
 

@@ -14,14 +14,14 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts import reader_registry
-from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.capture.layouts.calibration import CalibratedView, Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.capture.lens import MODELS
+from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.bounded import read_json
 from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.testing import assert_close
 from tests.capture.layouts.test_colmap import as_binary
 from tests.scenes import captures as layouts
@@ -153,6 +153,7 @@ def test_find_reader__follows_the_order_of_precedence(tmp_path):
             "28984, 31111",
             ("trial_Miqus_0_26580", "trial_Miqus_2_29005"),
         ),
+        (layouts.easymocap, "images/2/*", "2, 31", ("1", "10")),
     ],
 )
 def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
@@ -243,16 +244,16 @@ def split_meta(path, **cameras):
 def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path, caplog):
     path = split_meta(layouts.dynamic3dgs(tmp_path / "a"), train_meta=(1,), test_meta=(10, 2))
     calibration = reader_registry.find_reader(path).read(path)
-    assert (calibration.names, calibration.test_views) == (("1", "2", "10"), (1, 2))
+    assert (calibration.names, calibration.held_out) == (("1", "2", "10"), ("2", "10"))
     assert load_capture(path).test_views == (1, 2)
     assert load_capture(path, test_view=None).test_views == ()
     assert load_capture(path, reading=ReadConfig(without=("2",))).test_views == (1,)
     shutil.rmtree(path / "ims" / "2")
-    assert reader_registry.find_reader(path).read(path).test_views == (1,)
+    assert reader_registry.find_reader(path).read(path).held_out == ("10",)
     assert "no image of 2 was found: left out" in caplog.text
     # Which is trained on, too.
     path = split_meta(layouts.dynamic3dgs(tmp_path / "b"), test_meta=(10,))
-    assert reader_registry.find_reader(path).read(path).test_views == (2,)
+    assert reader_registry.find_reader(path).read(path).held_out == ("10",)
 
 
 JUNK = (
@@ -276,6 +277,7 @@ JUNK = (
         layouts.dynamic3dgs,
         layouts.anipose,
         layouts.qualisys,
+        layouts.easymocap,
     ],
 )
 def test_load_capture__ignores_what_systems_add(tmp_path, caplog, build):
@@ -295,13 +297,22 @@ def test_load_capture__ignores_what_systems_add(tmp_path, caplog, build):
 
 @pytest.mark.parametrize(
     "build",
-    [layouts.colmap, layouts.nerfstudio, layouts.dynamic3dgs, layouts.anipose, layouts.qualisys],
+    [
+        layouts.colmap,
+        layouts.nerfstudio,
+        layouts.dynamic3dgs,
+        layouts.anipose,
+        layouts.qualisys,
+        layouts.easymocap,
+    ],
 )
 def test_load_capture__reads_texts_of_windows(tmp_path, build):
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')
     unix_capture = load_capture(path)
-    for file in [file for file in path.rglob("*") if file.suffix in (".txt", ".json", ".toml")]:
+    for file in [
+        file for file in path.rglob("*") if file.suffix in (".txt", ".json", ".toml", ".yml")
+    ]:
         declared = (
             "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
         )
@@ -415,6 +426,7 @@ FAR = np.array([500000.0, 5300000.0, 120.0])
         layouts.anipose,
         layouts.colmap,
         layouts.dynamic3dgs,
+        layouts.easymocap,
         layouts.n3dv,
         layouts.nerfstudio,
         layouts.qualisys,
@@ -439,7 +451,8 @@ def test_load_capture__of_a_far_rig_is_relative_to_an_origin(tmp_path, caplog, m
 def test_centred__keeps_points_that_are_exact(tmp_path, kind, count):
     cameras = moved(rig(("cam1", "cam2", "cam3")), -FAR)
     points = (FAR[None] + 0.1).astype(kind)
-    calibration = Calibration(cameras, (), (), points, points).centred(tmp_path)
+    views = tuple(CalibratedView(camera, Lens(), tmp_path) for camera in cameras)
+    calibration = Calibration(views, points, points).centred(tmp_path)
     assert_close(calibration.points, (points - calibration.origin)[:count], atol=1e-6)
     assert calibration.points.dtype == np.float32
 

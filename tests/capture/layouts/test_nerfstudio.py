@@ -14,7 +14,7 @@ from numpy.testing import assert_array_equal
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.clips import size_of_clip
 from morgs_mi.capture.layouts.nerfstudio import READER
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.testing import assert_close
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
@@ -97,7 +97,7 @@ def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path):
     )
     full = load_capture(path)
     small = load_capture(path, 2)
-    alone = full.at_recorded_size()._sources[0].undistortion.mask
+    alone = full.views[0].source.undistortion.mask
     for mask in full.masks:
         assert not mask[:, : WIDTH // 2 - 2].any()
         assert not (mask & ~alone).any()
@@ -159,7 +159,7 @@ SPLITS = {
 @pytest.mark.parametrize(("lists", "views"), SPLITS.values(), ids=SPLITS)
 def test_nerfstudio__holds_out_the_views_of_its_splits(tmp_path, lists, views):
     path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
-    assert READER.read(path).test_views == views
+    assert READER.read(path).held_out == tuple(NAMES[v] for v in views)
     assert load_capture(path).test_views == views
     assert load_capture(path, test_view=None).test_views == ()
 
@@ -212,11 +212,11 @@ def test_nerfstudio__reads_synthetic_scenes(tmp_path, suffix):
 
 def test_nerfstudio__reads_a_synthetic_scene_without_held_out_images(tmp_path):
     path = synthetic(tmp_path / "a", ("train", "train"), square(("r_0", "r_1")))
-    assert READER.read(path).test_views is None
+    assert READER.read(path).held_out is None
     assert load_capture(path).names == ("r_0", "r_1")
     # BlenderNeRF writes an empty file of held-out images on request.
     (path / "transforms_test.json").write_text('{"camera_angle_x": 0.7, "frames": []}')
-    assert READER.read(path).test_views == ()
+    assert READER.read(path).held_out == ()
     assert load_capture(path).names == ("r_0", "r_1")
 
 

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.testing import assert_close
-from tests.core.test_files import tree
+from tests.platform.test_files import tree
 from tests.scenes.full_disk import files_end_at
 
 BOUNDS = np.array([[1.0, 9.0], [2.0, 8.0]])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.capture.lens import Lens, undistorted
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.extras.calibration.bundle import (
@@ -14,6 +13,7 @@ from morgs_mi.extras.calibration.bundle import (
     likely_deviations,
     prior_deviations,
 )
+from morgs_mi.fit.features import FeatureTracks, intersect
 from morgs_mi.fit.fit_config import CameraPriors
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
@@ -29,7 +29,7 @@ def seen_by(cameras, points=POINTS):
     """Return the exact features of all points in all cameras."""
     views, ids = (grid.ravel() for grid in np.mgrid[: len(cameras), : len(points)])
     pixels = np.concatenate([camera.project(points)[0] for camera in cameras])
-    return Tracks(ids, views, pixels, np.zeros((len(ids), 3)))
+    return FeatureTracks(ids, views, pixels, np.zeros((len(ids), 3)))
 
 
 def priors_of(cameras):

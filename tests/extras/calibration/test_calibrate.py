@@ -128,7 +128,7 @@ def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path):
     result = calibrate(film(tmp_path, cameras), CalibrateConfig(shared_intrinsics=True))
     assert len(pycolmap.Reconstruction(str(result.model)).cameras) == 2
     capture = load_capture(tmp_path)
-    assert capture.recorded_sizes == tuple(sizes)
+    assert [view.recorded_size for view in capture.views] == list(sizes)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
         assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
 
@@ -338,3 +338,11 @@ def test_calibrate__refuses_clips_that_cannot_be_calibrated(
     with pytest.raises(error, match=message):
         calibrate(path, dataclasses.replace(CalibrateConfig(), **config))
     assert sorted(tmp_path.rglob("*")) == old_files
+
+
+def test_calibrate__describes_the_folders_that_a_photo_lacks(tmp_path):
+    cv2.imwrite(str(tmp_path / "IMG_1.png"), noise(0, 64, 48))
+    with pytest.raises(
+        ValueError, match=r"at least two cameras, found IMG_1; .* one folder per camera: cam01/"
+    ):
+        calibrate(tmp_path)

@@ -8,7 +8,7 @@ from tests.scenes.programs import run_script
 SCRIPT = """
 import signal, time
 from morgs_mi.extras.calibration.calibrate import import_pycolmap
-from morgs_mi.core.interrupts import interruptible
+from morgs_mi.platform.interrupts import interruptible
 
 with interruptible():
     import_pycolmap()

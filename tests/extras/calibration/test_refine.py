@@ -7,8 +7,8 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.core.progress import Progress
 from morgs_mi.core.rig import scene_extent
+from morgs_mi.core.view import View, Views
 from morgs_mi.extras.calibration.bundle import changed_camera, prior_deviations
 from morgs_mi.extras.calibration.refine import (
     Refinement,
@@ -18,7 +18,8 @@ from morgs_mi.extras.calibration.refine import (
     register_camera,
 )
 from morgs_mi.fit.fit_config import CameraPriors, FitConfig, ShortFitConfig
-from morgs_mi.fit.view import View, rendered, withheld_blocks
+from morgs_mi.fit.view import rendered, withheld_blocks
+from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.fit_capture import with_points
@@ -104,7 +105,7 @@ def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, s
     deviations = scale * np.array([0.005] * 3 + [0.006] * 3 + [0.008, 0, 0, 0, 0])
     errors = deviations * np.random.default_rng(seed).normal(size=(9, 11))
     errors[list(far_capture.test_views)] = 0
-    capture = replace(far_capture, cameras=tuple(map(changed_camera, far_capture.cameras, errors)))
+    capture = far_capture.with_cameras(list(map(changed_camera, far_capture.cameras, errors)))
     config = FitConfig(refine_cameras="on", short_fits=replace(SHORT, steps=100))
     refined, _ = refine_cameras(capture, config, RenderConfig(), seed)
     # The positions of the splats in training cameras.
@@ -160,7 +161,7 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capt
     def with_an_empty_view(views, width, rng):
         rest, unseen = withheld_blocks(views, width, rng)
         return rest, [
-            unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)),
+            replace(unseen[0], mask=np.zeros(unseen[0].image.shape[:2], bool)),
             *unseen[1:],
         ]
 
@@ -201,8 +202,8 @@ def matched(capture):
 
 @pytest.mark.slow
 def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
-    monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
-    capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
+    monkeypatch.setattr("morgs_mi.fit.features.MAX_FEATURES", 300)
+    capture = textured_capture.with_cameras(disturbed(textured_capture.cameras))
     start, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
     changes, tracks = matched(capture)
     cameras = list(map(changed_camera, start, changes))
@@ -212,7 +213,7 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
 
 @pytest.mark.slow
 def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatch):
-    monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
+    monkeypatch.setattr("morgs_mi.fit.features.MAX_FEATURES", 300)
     terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]
     bent = textured_capture.with_cameras(textured_capture.cameras, terms)
     changes, _ = matched(bent)
@@ -221,9 +222,9 @@ def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatc
 
 
 def test_refine_cameras__needs_two_images(splat_capture):
-    fields = {name: getattr(splat_capture, name)[:1] for name in ("cameras", "masks", "_sources")}
+    alone = replace(splat_capture, views=Views(splat_capture.views[:1])).holding_out(None)
     with pytest.raises(ValueError, match="at least two training views, got 1"):
-        refine_cameras(replace(splat_capture, **fields, test_views=()), LEAST)
+        refine_cameras(alone, LEAST)
 
 
 def test_Refinement__reports_the_changes_and_the_gain():

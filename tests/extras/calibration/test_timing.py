@@ -6,6 +6,7 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.view import Views
 from morgs_mi.extras.calibration.timing import estimate_time_offsets
 from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.extras.synth.synth_config import SynthConfig
@@ -20,7 +21,7 @@ def test_estimate_time_offsets__refuses_a_single_frame(textured_capture):
 
 
 def test_estimate_time_offsets__refuses_a_single_camera(textured_capture):
-    alone = replace(textured_capture, cameras=textured_capture.cameras[:1])
+    alone = replace(textured_capture, views=Views(textured_capture.views[:1]))
     with pytest.raises(ValueError, match="expected at least 2 cameras to compare clocks, got 1"):
         estimate_time_offsets(alone)
 

@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.extras.exports.gltf_export import glb, gltf_axes, write_gltf
+from morgs_mi.extras.exports.gltf_export import LINEAR, glb, gltf_axes, write_gltf
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.testing import assert_close
-from tests.scenes.changing_splats import rig, splats
+from tests.cli.conftest import run
+from tests.reference import sh_basis
+from tests.scenes.changing_splats import rig, splats, write_stream
 
+__all__ = ["run"]
 KHR = "KHR_gaussian_splatting"
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 # KHR_gaussian_splatting's table of attributes; all may be float, with the component type 5126. All
@@ -120,6 +124,38 @@ def test_write_gltf__renders_the_same_image_in_gltf_axes(tmp_path, degree):
     image = rasterize(exported, replace(camera, viewmat=camera.viewmat @ rotation)).color
     # The rotation rounds the float32 attributes once more.
     assert_close(image, rasterize(gaussians, camera).color, atol=2e-4)
+
+
+def test_glb__has_linear_light_in_every_direction():
+    # Colours from 0.2 to 2 and small changes over the directions, as the slope of the curve holds.
+    coefficients = splats(degree=1).numpy()["sh_coeffs"] * np.float32([[0], [0.01], [0.01], [0.01]])
+    coefficients[:, 0] = (np.linspace(0.2, 2, 120).reshape(40, 3) - 0.5) / SH_C0
+    gaussians = replace(splats(degree=1), sh_coeffs=coefficients)
+    document, binary = read_glb(glb(gaussians, np.eye(3), LINEAR))
+    arrays = attributes(document, binary)
+    light = gaussians_of(arrays).numpy()["sh_coeffs"]
+    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+        basis = np.array(sh_basis(direction, 1))
+        encoded, linear = (0.5 + np.einsum("k,nkc->nc", basis, c) for c in (coefficients, light))
+        assert_close(linear / decode_light(encoded), 1, atol=2e-3)
+    mean = decode_light(0.5 + SH_C0 * coefficients[:, 0])
+    assert_close(0.5 + SH_C0 * light[:, 0], mean, rtol=1e-5)
+    assert_close(arrays["COLOR_0"][:, :3], np.minimum(mean, 1), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "color_space"),
+    [
+        ({}, "srgb_rec709_display"),
+        ({"transfer": {"name": TRANSFER, "display_exposure": -1}}, "lin_rec709_display"),
+    ],
+    ids=["8 bits", "linear light"],
+)
+def test_export_gltf__names_the_colour_space_of_the_recording(tmp_path, run, metadata, color_space):
+    write_stream(tmp_path / "s.morgs", 1, metadata=metadata)
+    assert run("export", "gltf", tmp_path / "s.morgs", tmp_path / "g.glb")[0] == 0
+    (primitive,) = read_glb((tmp_path / "g.glb").read_bytes())[0]["meshes"][0]["primitives"]
+    assert primitive["extensions"][KHR]["colorSpace"] == color_space
 
 
 def test_gltf_axes__have_y_up_and_the_cameras_at_positive_z():

@@ -233,3 +233,9 @@ def test_import__refuses(clip, tmp_path, run, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
     assert_refused(run("import", clip, *options), message)
     assert not Path("OUT").exists()
+
+
+def test_import_frames__names_the_remedy_of_a_format_that_is_not_read(tmp_path):
+    (tmp_path / "a.spz").touch()
+    with pytest.raises(ValueError, match=r"a\.spz: expected Gaussians as \.ply.*splat-transform"):
+        import_frames([tmp_path / "a.spz"], tmp_path / "out")

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
-from morgs_mi.core.color_space import decode_light
+from morgs_mi.core.color_space import TRANSFER, decode_light
 from morgs_mi.extras.light.insert import (
     InsertConfig,
     inserted_channels,
@@ -18,6 +18,7 @@ from morgs_mi.extras.light.insert import (
 from morgs_mi.io.exr import read_exr
 from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.player import render_stream
+from tests.playback.test_light import STOPS, written
 from tests.scenes.surfaces import camera, cloud
 
 CARD = """
@@ -165,3 +166,24 @@ def test_load_insert__refuses_bad_files(stream, tmp_path, name, text, message):
 def test_render_inserted__refuses_bad_scenes(stream, entries, message):
     with pytest.raises(ValueError, match=message):
         next(render_inserted(stream, camera(), lambda *_: entries))
+
+
+@pytest.mark.slow
+def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(tmp_path):
+    ball = {"type": "sphere", "center": [0, 0, -1], "radius": 0.2}
+    transfer = {"transfer": {"name": TRANSFER, "display_exposure": STOPS}}
+    light = open_stream(written(tmp_path / "light.morgs", transfer))
+    plain = open_stream(written(tmp_path / "plain.morgs", {}))
+
+    def inserted(stream, clipped):
+        config = InsertConfig(4, shadows=False, clipped=clipped)
+        (frame,) = render_inserted(
+            stream, camera(), lambda frame, time: {"ball": ball}, [0], config=config
+        )
+        return frame[1]["color"]
+
+    recorded = inserted(light, 1.0)
+    guessed = inserted(plain, 4.0)
+    assert_array_equal(inserted(light, None), recorded)
+    assert_array_equal(inserted(plain, None), guessed)
+    assert np.abs(recorded - guessed).max() > 0.1

@@ -43,7 +43,7 @@ def opened():
     """Feeds that are closed in the end, with their sources."""
     feeds = []
 
-    def open_feed(*shots, timeout=0.3, warm_up=0.0):
+    def open_feed(*shots, timeout=1.0, warm_up=0.0):
         sources = [Source(count) for count in shots]
         cameras = {f"cam{k}": source for k, source in enumerate(sources)}
         feeds.append((CameraFeed(cameras, timeout, warm_up), sources))
@@ -76,7 +76,7 @@ def test_CameraFeed__skips_what_arrived_during_a_fit(opened):
     assert ahead.max() < 4
     assert second.dropped == min(second.numbers) - 1, "of the camera that dropped fewer"
     assert second.time >= first.time
-    assert 0 <= second.skew < 0.3
+    assert 0 <= second.skew < 0.5
 
 
 def test_CameraFeed__waits_for_new_images_of_all(opened):
@@ -97,10 +97,10 @@ def test_CameraFeed__leaves_out_a_silent_camera_until_it_is_back(opened):
     waited = time.monotonic()
     a.deliver()
     third = feed.newest(second)
-    assert waited - start >= 0.3
-    assert time.monotonic() - waited < 0.2, "it is not waited for again"
+    assert waited - start >= 1
+    assert time.monotonic() - waited < 1, "it is not waited for again"
     assert second.images[1] is None is third.images[1]
-    assert feed.problem(1) == "no image for 0.3 s"
+    assert feed.problem(1) == "no image for 1 s"
     a.deliver()
     b.deliver()
     wait_for(feed, 4, 2)
@@ -123,7 +123,7 @@ def test_CameraFeed__leaves_out_a_camera_that_ends_at_once_and_ends_with_the_las
 def test_CameraFeed__names_a_camera_without_a_first_image(opened):
     feed, (_, b) = opened(1, 0)
     with pytest.raises(
-        ValueError, match=r"images of cam1, got none \(it is silent\); .* longer than 0.3 s"
+        ValueError, match=r"images of cam1, got none \(it is silent\); .* longer than 1 s"
     ):
         feed.newest()
     b.end()
@@ -145,7 +145,7 @@ def test_CameraFeed__lets_the_cameras_adjust_their_exposure(opened):
     start = time.monotonic()
     clip.end()
     assert feed.newest() is not None, "a short clip"
-    assert time.monotonic() - start < 1
+    assert time.monotonic() - start < 4
 
 
 def test_CameraFeed__refuses_images_of_different_times(opened):

@@ -5,13 +5,15 @@ from unittest.mock import Mock
 
 import pytest
 
-from morgs_mi.core.files import PROVISIONAL
 from morgs_mi.extras.live import command as module
 from morgs_mi.extras.live.command import Live, LiveSettings, _Lines, _summary
 from morgs_mi.extras.live.fit_live import LiveFrame
+from morgs_mi.extras.live.live_config import LIVE_STREAM
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.platform.files import PROVISIONAL
 from morgs_mi.playback.streams import open_stream
 from tests.cli.commands import assert_refused, interrupt
+from tests.cli.test_settings import check_help
 from tests.quick import OPTIONS
 from tests.scenes import noise_capture
 
@@ -120,3 +122,7 @@ def test_summary__has_means_of_the_later_frames(tmp_path):
         f"{tmp_path}/stream.morgs: fitted 3 of 923 frames (920 dropped) in 32.0 s, 2.3 MB, 30.0 s "
         "for the first one, mean latency of the others 0.60 s, largest skew 12 ms."
     )
+
+
+def test_help__shows_the_defaults_of_live_fits(capsys):
+    check_help("live", LIVE_STREAM, capsys)

@@ -111,4 +111,4 @@ def test_live_page__loop_runs(rig, monkeypatch):
     assert addresses == [f"rtsp://10.0.0.{k}/live" for k in (10, 11, 12)]
     pushed = [call.args[0] for call in loop().push.call_args_list]
     assert len(pushed) == 3
-    assert all(image.shape == (23, 31, 3) for image in pushed[0])
+    assert all(view.image.shape == (23, 31, 3) for view in pushed[0])

@@ -11,7 +11,12 @@ import pytest
 from morgs_mi.extras.live import sources as module
 from morgs_mi.extras.live.live_config import LiveConfig
 from morgs_mi.extras.live.sources import ClipClock, is_video, open_feed, play
+from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
+from tests.io.test_frame_times import clip as numbered_clip
+from tests.io.test_frame_times import number
+from tests.scenes.captures import write_timed_video
+from tests.scenes.edit_lists import show_parts
 
 
 def clip(path, count, fps=50):
@@ -126,3 +131,14 @@ def test_open_feed__of_videos_begins_with_their_first_images(tmp_path, loop):
             assert feed.ended() == "cam0, cam1: it has ended; --loop repeats videos"
     finally:
         feed.close()
+
+
+def test_play__shows_the_frames_of_the_reader(tmp_path):
+    write_timed_video(tmp_path / "a.mp4", numbered_clip(20), range(0, 200, 10), "libx264")
+    show_parts(tmp_path / "a.mp4", [(0.05, 0.08)])
+    played = [number(image) for image in play(tmp_path / "a.mp4", ClipClock(), Event())]
+    assert (
+        played
+        == [number(image) for image in VideoReader.open(tmp_path / "a.mp4").frames()]
+        == list(range(5, 13))
+    )

@@ -11,19 +11,20 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.config import apply_values, config_toml, read_config
-from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.extras.sweep import fits as fits_module
 from morgs_mi.extras.sweep import sweep as module
 from morgs_mi.extras.sweep.clock import Clock
-from morgs_mi.extras.sweep.fits import Fit, Fits
+from morgs_mi.extras.sweep.fits import Fits, StoredFit
 from morgs_mi.extras.sweep.statistics import INDEX, SCORES
 from morgs_mi.extras.sweep.sweep import PARTS, leave_out, sweep
 from morgs_mi.extras.sweep.vary import Vary
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.config import apply_values, config_toml, read_config
+from morgs_mi.platform.files import write_json
+from morgs_mi.platform.progress import name_of
 from morgs_mi.playback.streams import open_stream
 from tests.cli.commands import assert_refused, interrupt
 from tests.cli.conftest import run
@@ -41,7 +42,14 @@ def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path,
     out = tmp_path / "out"
     configs = {"default": QUICK, "baseline": apply_preset(QUICK, "baseline")}
     arguments = (capture, configs, Vary((2, 1), (9, 6)), 2, 2, out)
-    result = sweep(*arguments)
+    states = []
+    result = sweep(*arguments, lambda *state: states.append(state))
+    stages, counts, totals = zip(*states, strict=True)
+    assert {name_of(stage) for stage in stages} == {"Fitting and evaluating"}
+    assert any(stage.endswith(", first frame") for stage in stages)
+    assert counts == tuple(sorted(counts))
+    assert len({*counts}) > 3 * 12
+    assert {*totals} == {12}
     arms = [(arm.name, arm.point) for arm in result.arms]
     first_arms = [("default and baseline", 6), ("default and baseline", 9)]
     later_arms = [("default", 1), ("baseline", 1), ("default", 2), ("baseline", 2)]
@@ -104,7 +112,7 @@ def test_sweep__measures_lpips_of_fits_that_are_there(tmp_path, monkeypatch):
     out = tmp_path / "out"
     result = sweep(*arguments, Vary((1,), ()), 1, out=out)
     assert np.isnan(result.scores[0, 0, INDEX["lpips"]])
-    monkeypatch.setattr(fits_module, "extra", lambda registry, name: HalfLpips)
+    monkeypatch.setattr(fits_module, "Lpips", HalfLpips)
     monkeypatch.setattr(fits_module, "stream_capture", interrupt)
     again = sweep(*arguments, Vary((1,), (), "lpips:net:1.onnx"), 1, out=out)
     assert again.scores[0, 0, INDEX["lpips"]] == 0.5
@@ -377,14 +385,14 @@ def test_stored_fit__refuses_what_no_sweep_has_written(tmp_path, text):
 
 def test_stored_fit__is_what_was_written(tmp_path):
     scores = [1.0, 2.0, 3.0, 4.0, 0.5, None, None, 8.0]
-    fit = Fit([{}, None], Clock("date", "call", 1.0, 2.0, 3.0, 4.0), "", scores)
+    fit = StoredFit([{}, None], Clock("date", "call", 1.0, 2.0, 3.0, 4.0), "", scores)
     write_json(tmp_path / "scores.json", asdict(fit))
     assert fits_module.stored_fit(tmp_path / "scores.json") == fit
 
 
 def test_first_frame_config__is_shared_by_the_presets_and_parts_of_later_frames():
     first = fits_module.first_frame_config
-    presets = ["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
+    presets = ["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper"]
     configs = [first(apply_preset(StreamConfig(), name)) for name in presets]
     assert all(config == first(StreamConfig()) for config in configs)
     first_parts = [

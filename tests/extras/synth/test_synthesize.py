@@ -12,13 +12,13 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
 from morgs_mi.capture.truth import load_truth
-from morgs_mi.core.bounded import read_json
 from morgs_mi.extras.synth.disturbances import Disturbances
 from morgs_mi.extras.synth.scene import Light, Object, Scene, load_scene
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.extras.synth.textures import lights, textured
 from morgs_mi.io.clip_readers import open_frames
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.testing import assert_close
 
 TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
@@ -205,3 +205,11 @@ def test_synthesize__warns_of_black_images(tmp_path, caplog):
         TINY,
     )
     assert "scene 'mine': cam00 is black at 0 s: no lamp reaches" in caplog.text
+
+
+def test_synthesize__checks_the_memory_before_work_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr("morgs_mi.platform.memory.free_memory", lambda: 8e9)
+    with pytest.raises(
+        ValueError, match=r"fits in the 8\.0 GB of free .*, got images of 1000000000x1000000000 pix"
+    ):
+        synthesize("spheres", tmp_path / "a", replace(TINY, width=10**9, height=10**9))

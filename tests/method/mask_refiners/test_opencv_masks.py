@@ -1,13 +1,12 @@
-"""GrabCut and superpixels: objects from partial masks, any mask and size, repeatable results."""
+"""GrabCut: objects from partial masks, any mask and size, repeatable results."""
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
-from morgs_mi.method.mask_refiners.opencv_masks import clean_mask, refine_mask, vote_superpixels
+from morgs_mi.method.mask_refiners.opencv_masks import clean_mask, refine_mask
 from tests.method.moving_disc import moving_disc
 
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
@@ -20,22 +19,7 @@ def test_refine_mask__recovers_an_object_from_a_part_of_it():
     assert iou(refine_mask(image, partial, MaskConfig()), disc) > 0.95 > iou(partial, disc)
 
 
-def test_vote_superpixels__removes_flow_that_bleeds_over_an_edge():
-    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
-    bleeding = cv2.dilate(disc.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    voted = vote_superpixels(image, bleeding, MaskConfig())
-    assert iou(voted, disc) > 0.9 > iou(bleeding, disc)
-    assert voted[disc].mean() > 0.98
-
-
-def test_vote_superpixels__removes_specks():
-    _, image, _ = moving_disc(240, 320, (0, 0))
-    specks = np.zeros((240, 320), bool)
-    specks[10:230:12, 10:310:12] = True
-    assert not vote_superpixels(image, specks, MaskConfig()).any()
-
-
-@pytest.mark.parametrize("method", ["none", "grabcut", "superpixels+grabcut"])
+@pytest.mark.parametrize("method", ["none", "grabcut"])
 def test_mask_refiner__is_repeatable(method):
     _, image, disc = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     refine = MASK_REFINERS.make(method)
@@ -44,15 +28,14 @@ def test_mask_refiner__is_repeatable(method):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (700, 20)])
-@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
-def test_refine_mask__and_vote_superpixels_accept_any_mask(refine, size):
+def test_refine_mask__accepts_any_mask(size):
     image = np.random.default_rng(0).random((*size, 3))
     rows = np.arange(size[0])
     center = (size[0] // 2, size[1] // 2)
     masks = {name: np.full(size, name == "all") for name in ("nothing", "speck", "all", "half")}
     masks["speck"][center] = True
     masks["half"][rows < size[0] // 2] = True
-    refined = {name: refine(image, mask, MaskConfig()) for name, mask in masks.items()}
+    refined = {name: refine_mask(image, mask, MaskConfig()) for name, mask in masks.items()}
     assert {(mask.shape, mask.dtype) for mask in refined.values()} == {(size, np.dtype(bool))}
     assert not refined["nothing"].any()
     assert refined["all"].all()
@@ -68,16 +51,8 @@ def test_clean_mask__removes_specks_and_closes_holes():
     assert not cleaned[:, 250:].any()
 
 
-@pytest.mark.parametrize(
-    ("refine", "settings"),
-    [
-        (refine_mask, {"working_width": 160}),
-        (vote_superpixels, {"working_width": 160, "superpixel_share": 0.5}),
-    ],
-)
-def test_mask_config__every_setting_acts(refine, settings):
+def test_mask_config__working_width_acts():
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     mask = np.roll(disc, (25, 19), (0, 1))
-    usual = refine(image, mask, MaskConfig())
-    for name, value in settings.items():
-        assert not np.array_equal(refine(image, mask, MaskConfig(**{name: value})), usual), name
+    usual = refine_mask(image, mask, MaskConfig())
+    assert not np.array_equal(refine_mask(image, mask, MaskConfig(working_width=160)), usual)

@@ -15,14 +15,25 @@ HEIGHT = 360
 # A software rasteriser on a busy machine starts slowly.
 TIMEOUT_MS = 60_000
 HIDDEN = "#bar, #legend, #message, #notes {visibility: hidden}"
+# Sorting waits for `sortAll`, from the beginning of the page.
+HOLD_FIRST_SORTING = """
+const post = Worker.prototype.postMessage;
+const held = new Promise((resolve) => (window.sortAll = resolve));
+Worker.prototype.postMessage = function (message, ...rest) {
+  const send = () => post.call(this, message, ...rest);
+  if (message.name === "sortSplats32") held.then(send);
+  else send();
+};
+"""
 
 
 class Page:
     """A page with what it requested and what it reported."""
 
-    def __init__(self, browser, address, **context):
+    def __init__(self, browser, address, script="", **context):
         options = {"viewport": {"width": WIDTH, "height": HEIGHT}, **context}
         self.page = browser.new_context(**options).new_page()
+        self.page.add_init_script(script)
         self.page.set_default_timeout(TIMEOUT_MS)
         self.errors = []
         self.requests = []

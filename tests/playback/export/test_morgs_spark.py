@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.core.bounded import read_json
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.platform.bounded import read_json
 from morgs_mi.playback.export.web import write_web_folder
 from morgs_mi.playback.player import render
 from morgs_mi.playback.stream_header import render_config

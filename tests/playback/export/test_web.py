@@ -6,6 +6,7 @@ import base64
 import itertools
 import os
 import re
+import shutil
 from dataclasses import replace
 from importlib.resources import files
 
@@ -27,6 +28,8 @@ from morgs_mi.core.color_space import TRANSFER, exposed
 from morgs_mi.core.rig import seen_points
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.ply import write_ply
+from morgs_mi.platform.files import write_json
+from morgs_mi.playback.default_rig import box_corners
 from morgs_mi.playback.export.web import (
     stream_html,
     text_of_bytes,
@@ -36,7 +39,7 @@ from morgs_mi.playback.export.web import (
 from morgs_mi.playback.player import channel_image, picture, render
 from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
-from tests.playback.export.pages import HEIGHT, WIDTH, Page, served
+from tests.playback.export.pages import HEIGHT, HOLD_FIRST_SORTING, WIDTH, Page, served
 from tests.scenes.changing_splats import rig, splats, write_stream
 from tests.scenes.gaussians import isotropic
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, EXACT, PIXELS, STEP
@@ -147,7 +150,7 @@ def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
     assert main(["export", "web", str(tmp_path)]) == 0
     assert main(["export", "web", str(tmp_path), str(tmp_path / "site"), "--title", "A clip"]) == 0
     assert (tmp_path / "player.html").stat().st_size > 1e6
-    assert main(["export", "web", str(tmp_path), str(tmp_path / "right"), "--front", "right"]) == 0
+    assert main(["export", "web", str(tmp_path), str(tmp_path / "right"), "--camera", "right"]) == 0
     assert open_stream(tmp_path / "right").cameras[0].name == "right"
     assert b"<title>A clip</title>" in (tmp_path / "site" / "index.html").read_bytes()
     assert "player.html: 4 frames" in " ".join(capsys.readouterr().out.split())
@@ -365,6 +368,24 @@ def test_page__draws_orbits_back_to_the_cameras_unless_it_is_switched_off(page):
     assert drag(page, 0) == pytest.approx(8, abs=0.2)
 
 
+def test_page__says_once_what_to_expect_between_the_cameras(browser, clip, tmp_path):
+    shutil.copy(clip[0] / "stream.morgs", tmp_path)
+    validation = {"quality": "poor", "spacing": 58.2}
+    write_json(tmp_path / "report.json", {"frames": [{"validation": validation}]})
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    with Player(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
+        notes = page.page.locator("#notes")
+        page.page.keyboard.press("c")  # another camera is no orbit
+        page.wait("player.settled")
+        assert not notes.is_visible()
+        page.page.keyboard.press("Shift+ArrowRight")
+        notes.get_by_text("Between the cameras: poor (58 degrees apart).").wait_for()
+        notes.wait_for(state="hidden")
+        page.page.keyboard.press("Shift+ArrowRight")
+        page.page.wait_for_timeout(300)
+        assert not notes.is_visible()
+
+
 def test_page__fills_the_window_with_a_file_and_orbits_freely(browser, tmp_path):
     write_ply(tmp_path / "scene.ply", splats(degree=3))
     stream = open_stream(tmp_path / "scene.ply")
@@ -374,20 +395,91 @@ def test_page__fills_the_window_with_a_file_and_orbits_freely(browser, tmp_path)
         fields = opened.page.evaluate(f"player.view.fields({WIDTH}, {HEIGHT})")
         image = picture(stream, state.gaussians, camera_of_fields(fields, "page"))
         assert psnr(opened.image() / 255, image / 255) > 40
-        _, pixels, _ = seen_points(stream.cameras[0], np.asarray(state.gaussians.means))
+        bar = opened.page.locator("#bar").bounding_box()
+        corners, _ = camera_of_fields(fields, "page").project(
+            box_corners(np.array(stream.metadata["box"]))
+        )
+        left, top = corners.min(axis=0)
+        right, bottom = corners.max(axis=0)
+        assert min(left, top, WIDTH - right, bar["y"] - bottom) == pytest.approx(12, abs=0.1)
+        assert (left + right, top + bottom) == pytest.approx((WIDTH, bar["y"]), abs=0.1)
         _, shown, _ = seen_points(
             camera_of_fields(fields, "page"), np.asarray(state.gaussians.means)
         )
-        # But for the margin of 15 % around them.
-        assert (np.ptp(shown, axis=0) / (WIDTH, HEIGHT)).max() == pytest.approx(1 / 1.15, abs=0.01)
-        assert np.ptp(shown, axis=0).max() > np.ptp(pixels, axis=0).max() * WIDTH / 1280
-        assert opened.page.evaluate("player.view.bounded") is False
-        visible = [
-            opened.page.locator(f"#{name}").is_visible()
-            for name in ("slider", "speed", "loop", "camera", "full")
-        ]
-        assert visible == [False, False, False, True, True]
+        assert len(shown) == len(state.gaussians.means)
+        assert shown[:, 1].max() < bar["y"] - 12
         assert opened.errors == []
+
+
+def test_page__has_no_controls_of_a_clip_for_a_file(browser, tmp_path):
+    write_ply(tmp_path / "scene.ply", splats(degree=3))
+    write_web_page(open_stream(tmp_path / "scene.ply"), tmp_path / "page.html")
+    with Player(browser, (tmp_path / "page.html").as_uri()) as opened:
+        locate = opened.page.locator
+        names = ("slider", "speed", "loop", "bound", "camera", "full")
+        visible = [locate(f"#{name}").is_visible() for name in names]
+        assert visible == [False, False, False, False, True, True]
+        # As wide as its buttons.
+        spare = locate("#bar").bounding_box()["width"] - locate("#options").bounding_box()["width"]
+        last = locate("#about").bounding_box()
+        first = locate("#camera").bounding_box()
+        assert last["x"] + last["width"] - first["x"] == pytest.approx(
+            locate("#options").bounding_box()["width"], abs=1
+        )
+        assert spare < 24
+        for key in (" ", "2", "3", "b", "l"):
+            opened.page.keyboard.press(key)
+        assert opened.page.evaluate(
+            "[player.playback.playing, player.splats.mode, player.view.bounded]"
+        ) == [False, "color", False]
+        opened.page.keyboard.press("?")
+        assert "colour, depth" in opened.text("#help")
+        assert not re.search("play and pause|previous|repeat|near", opened.text("#help"))
+
+
+@pytest.mark.parametrize(
+    "size", [{"width": 640, "height": 400}, {"width": 390, "height": 844}], ids=["wide", "upright"]
+)
+@pytest.mark.parametrize("kind", ["clip", "file"])
+def test_page__shows_the_poster_where_the_first_sorted_picture_will_be(
+    browser, clip, tmp_path, kind, size
+):
+    page_file = clip[0] / "page.html"
+    if kind == "file":
+        page_file = tmp_path / "page.html"
+        write_ply(tmp_path / "scene.ply", splats(degree=3))
+        write_web_page(open_stream(tmp_path / "scene.ply"), page_file)
+    with Page(browser, f"{page_file.as_uri()}#pause", HOLD_FIRST_SORTING, viewport=size) as page:
+        bar = page.page.locator("#bar").bounding_box()
+        at = page.page.locator("#poster").bounding_box()
+        page.wait("!!window.player && player.splats?.spark.sorting")
+        page.page.wait_for_timeout(300)
+        assert not page.page.locator("#canvas").is_visible()
+        poster = page.image()
+        page.page.evaluate("sortAll()")
+        page.wait("player.settled")
+        assert not page.page.locator("#poster").is_visible()
+        place = page.page.evaluate("player.view.rectangle")
+        assert [place[name] for name in at] == pytest.approx(list(at.values()), abs=3)
+        assert page.page.locator("#bar").bounding_box() == bar
+        left = max(0, round(at["x"]))
+        top = max(0, round(at["y"]))
+        rows = slice(top, round(at["y"] + at["height"]))
+        columns = slice(left, max(left, round(at["x"] + at["width"])))
+        shown = page.image()[rows, columns]
+        assert psnr(poster[rows, columns] / 255, shown / 255) > 22  # it is JPEG, and resized
+        assert not page.errors
+
+
+def test_page__draws_orbits_back_as_fast_at_any_frame_rate(page):
+    turned = """(parts) => {
+      player.selectCamera(0);
+      player.view.turn(0.5, 0);
+      for (let i = 0; i < parts; i++) player.view.update(1 / 60 / parts);
+      return player.view.camera.position.toArray();
+    }"""
+    once, often = (page.page.evaluate(turned, parts) for parts in (1, 4))
+    assert once == pytest.approx(often, abs=1e-6)
 
 
 def test_page__shows_an_hdr_stream_at_its_exposure(browser, clip, tmp_path):
@@ -445,7 +537,9 @@ def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
         for control in page.page.locator("#bar button, #bar select, #bar input").all():
             box = control.bounding_box()
             assert box is None or (
-                box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 32
+                box["x"] >= 0
+                and box["x"] + box["width"] <= 390
+                and min(box["width"], box["height"]) >= 44
             )
         assert not page.errors
 
@@ -453,15 +547,14 @@ def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
 def test_page__covers_an_upright_phone_around_what_moves(browser, clip):
     upright = {"viewport": {"width": 240, "height": 480}}
     with Player(browser, (clip[0] / "page.html").as_uri() + "#pause", **upright) as page:
-        assert page.page.evaluate("player.view.frame.height") == HEIGHT
         place = page.page.evaluate("player.view.rectangle")
         assert place["y"] == 0
         assert place["height"] == 480
         gaussians = clip[1][0].gaussians
         _, pixels, _ = seen_points(open_stream(clip[0]).cameras[0], np.asarray(gaussians.means))
         moving = pixels[np.asarray(gaussians.logit_confidence) > 0, 0]
-        frame = page.page.evaluate("player.view.frame")
-        assert abs(np.median(moving) - frame["x"] - frame["width"] / 2) < 12
+        scale = 480 / HEIGHT
+        assert abs(place["x"] + scale * np.median(moving) - 240 / 2) < 12 * scale
         assert not page.errors
 
 
@@ -541,6 +634,8 @@ def test_page__shows_its_first_frame_without_webgl(browser, clip):
     page = context.new_page()
     page.goto((clip[0] / "page.html").as_uri())
     page.get_by_text("This page needs WebGL 2, which this browser does not offer").wait_for()
+    assert page.locator("#poster").is_visible()
+    assert not page.locator("#bar").is_visible()
     data = base64.b64decode(page.locator("#poster").get_attribute("src").partition(",")[2])
     poster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     stream = open_stream(clip[0])

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.core.files import PROVISIONAL
+from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.platform.files import PROVISIONAL
 from morgs_mi.playback.player import picture
 from morgs_mi.playback.streams import open_stream
-from tests.playback.export.pages import HEIGHT, WIDTH, Page
+from tests.playback.export.pages import HEIGHT, HOLD_FIRST_SORTING, WIDTH, Page
 from tests.playback.viewer.serving import decoded, viewing
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import NAMES, rig, splats, write_stream
@@ -85,14 +86,17 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
         viewing(tmp_path) as url,
         Viewed(browser, url, "follow", "the stream has no frame yet") as page,
     ):
+        bar = page.page.locator("#bar").bounding_box()  # of a clip
+        assert page.page.locator("#slider").is_visible()
         write_stream(
             tmp_path / PROVISIONAL,
             1,
-            splats(30, seed=3),
+            splats(1200, seed=3),
             rig(WIDTH, HEIGHT),
-            {**open_stream(tmp_path).metadata, "provisional": {"seconds": 6.2, "left": 6.1}},
+            {**open_stream(tmp_path).metadata, "provisional": {"seconds": 540, "left": 361}},
         )
-        page.page.get_by_text("first frame: 30 Gaussians after 6 s, about 6 s left.").wait_for()
+        page.page.get_by_text("first frame: 1,200 Gaussians, 9 min, 6 min left").wait_for()
+        assert not page.page.locator("#curve").is_visible(), "there are no recorded images"
         page.wait(READY)
         assert not page.page.locator("#message").is_visible()
         provisional = page.image()
@@ -101,7 +105,7 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
         page.page.get_by_text("Provisional first frame").wait_for(state="hidden")
         page.wait(READY)
         assert not np.array_equal(page.image(), provisional)
-        assert not page.page.locator("#slider").is_visible()
+        assert page.page.locator("#bar").bounding_box() == bar
         file.write_bytes(complete[: ends[2] + 10])  # and a part of a packet
         page.shows("1 / 1")
         page.page.get_by_text("truncated or damaged at byte").wait_for()  # nothing follows
@@ -115,6 +119,18 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
         followed = page.image()
     with viewing(clip[0]) as url, Viewed(browser, url, "pause&frame=3") as page:
         assert np.array_equal(page.image(), followed)
+        assert not page.errors
+
+
+def test_page__shows_the_exact_image_until_the_first_sorted_picture(browser, url):
+    with Page(browser, f"{url}#pause&frame=0", HOLD_FIRST_SORTING) as page:
+        page.wait("document.getElementById('poster').naturalWidth > 0")
+        page.wait("!!window.player && player.splats?.spark.sorting")
+        poster = page.image()
+        page.page.evaluate("sortAll()")
+        page.wait(READY)
+        assert not page.page.locator("#poster").is_visible()
+        assert psnr(poster / 255, page.image() / 255) > 22
         assert not page.errors
 
 

@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts import poses_bounds, reader_registry
 from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.core.camera import Camera
@@ -68,14 +67,16 @@ def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return [(i, j) for i, j in np.argwhere(np.triu(same, 1)).tolist()]
 
 
-def rig_candidates(capture: Capture) -> Iterator[tuple[Sequence[Camera], str]]:
-    """Yield the corrected cameras of a capture for each mistake that concerns several poses."""
-    cameras = capture.cameras
-    if capture.layout == poses_bounds.READER.name:
-        alphabetical = sorted(capture.names)
+def rig_candidates(
+    cameras: Sequence[Camera], layout: str
+) -> Iterator[tuple[Sequence[Camera], str]]:
+    """Yield the corrected cameras of a layout for each mistake that concerns several poses."""
+    if layout == poses_bounds.READER.name:
+        names = [camera.name for camera in cameras]
+        alphabetical = sorted(names)
         order = ", ".join(alphabetical[:4])
         yield (
-            [cameras[alphabetical.index(name)] for name in capture.names],
+            [cameras[alphabetical.index(name)] for name in names],
             f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical "
             "order",
         )
@@ -86,7 +87,7 @@ def rig_candidates(capture: Capture) -> Iterator[tuple[Sequence[Camera], str]]:
         )
     else:
         conventions = {reader.name: reader.poses for reader in reader_registry.READERS}
-        poses = conventions.get(capture.layout, PoseConvention())
+        poses = conventions.get(layout, PoseConvention())
         if poses:
             # Images do not determine a rotation of the world, so there are only four
             # distinguishable conventions of 4x4 matrices.

@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.features import Match, detect, match_views, reprojection_errors
-from morgs_mi.capture.points import MAX_ERROR, SharedFeatures
+from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.checks.mistakes import (
     camera_candidates,
     duplicate_poses,
@@ -26,7 +25,8 @@ from morgs_mi.extras.calibration.checks.mistakes import (
     rig_candidates,
     with_focal_factor,
 )
-from morgs_mi.fit.view import View
+from morgs_mi.fit.features import Match, detect, match_views, reprojection_errors
+from morgs_mi.fit.image_points import MAX_ERROR
 
 # With a wrong pose a few matches may fit by chance, but not this many.
 _MIN_MATCHES = 50
@@ -86,22 +86,37 @@ class RigCheck:
     fits: bool | None
     advice: str  #: One sentence with the result, and the remedy if it is the same for all cameras.
 
+    @property
+    def unmatched(self) -> bool:
+        """Whether all images show something, but none has enough matches with others."""
+        return all(check.advice.endswith(_NO_OVERLAP) for check in self.cameras)
+
 
 def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return the result of checking the capture's cameras against the matches between its views."""
-    capture = capture.at_recorded_size()
-    pairs = _Pairs.of(shared, capture.cameras)
+    return check_cameras(capture.at_recorded_size().cameras, capture.layout, shared)
+
+
+def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures) -> RigCheck:
+    """Return the result of checking cameras against the matches between their views.
+
+    Args:
+        cameras: one per view, at the size of its features.
+        layout: of their file, the mistakes of which are looked for.
+        shared: features of the views, and their matches.
+    """
+    pairs = _Pairs.of(shared, cameras)
     group = pairs.agreeing()
-    checks = [_check(view, pairs, group) for view in range(len(capture.cameras))]
+    checks = [_check(view, pairs, group) for view in range(len(cameras))]
     errors = np.concatenate([np.zeros(0), *pairs.errors])
     # Of so few matches, a wrong correction explains enough by chance.
     has_many = 2 * len(errors) >= _MIN_MATCHES * len(checks)
-    correction = _correct_rig(capture, pairs.sampled(), checks) if has_many else None
+    correction = _correct_rig(layout, pairs.sampled(), checks) if has_many else None
     if correction:
-        cameras, explanation = correction
+        corrected, explanation = correction
         # The views with another corrected camera are wrong.
         views = range(len(cameras))
-        culprits = {view for view in views if cameras[view] is not pairs.cameras[view]}
+        culprits = {view for view in views if corrected[view] is not pairs.cameras[view]}
         checks = [_check(view, pairs, set(views) - culprits) for view in views]
         for view in culprits:
             if checks[view].matches:
@@ -146,10 +161,8 @@ def pose_problems(views: Sequence[View]) -> list[str]:
         # In px of one size, as the limits of the errors are.
         features.append(replace(detected, points=detected.points * camera.size / size))
         cameras.append(replace(camera, name=camera.name or f"view {index}"))
-    none = np.zeros((0, 3))
-    capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
     matches = match_views(features, cameras)
-    check = check_rig(capture, SharedFeatures(tuple(features), tuple(matches)))
+    check = check_cameras(cameras, "", SharedFeatures(tuple(features), tuple(matches)))
     order = "a list of images has the cameras' order, a dict their names"
     return [f"{check.advice.rstrip('.')}; {order}."] if check.fits is False else []
 
@@ -266,7 +279,7 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
 
 
 def _correct_rig(
-    capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]
+    layout: str, pairs: _Pairs, checks: Sequence[CameraCheck]
 ) -> tuple[Sequence[Camera], str] | None:
     """Return the cameras corrected for a mistake in several poses, and its description; None if
     none explains all.
@@ -280,7 +293,7 @@ def _correct_rig(
         lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
     )
     if error > _GOOD_ERROR:
-        candidates = [*rig_candidates(capture), *candidates]
+        candidates = [*rig_candidates(pairs.cameras, layout), *candidates]
     errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
     if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
         return candidates[int(np.argmin(errors))]

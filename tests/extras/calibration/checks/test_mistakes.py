@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.capture.features import match_views
-from morgs_mi.capture.points import MAX_ERROR, SharedFeatures
+from morgs_mi.capture.points import SharedFeatures
+from morgs_mi.core.view import Views
 from morgs_mi.extras.calibration.checks.rig_check import check_rig
+from morgs_mi.fit.features import match_views
+from morgs_mi.fit.image_points import MAX_ERROR
 from tests.scenes.textured import turned, with_cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -139,7 +141,7 @@ def test_check_rig__names_images_in_another_order(capture, shared, order, wrong,
 @pytest.mark.parametrize("count", [2, 4])
 def test_check_rig__names_swapped_images_in_a_small_rig(capture, shared, count):
     """One wrong pose out of a few spoils the matches of most cameras."""
-    part = replace(capture, cameras=capture.cameras[:count])
+    part = replace(capture, views=Views(capture.views[:count]))
     check = check_rig(part, with_images(shared, part, (1, 0, 2, 3)[:count]))
     assert check.fits is False
     assert "the clips of cam0 and cam1, or their poses, seem to be swapped" in check.advice

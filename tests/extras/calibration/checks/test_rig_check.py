@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.features import detect
 from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
+from morgs_mi.core.view import View, Views
 from morgs_mi.extras.calibration.checks.rig_check import check_rig, pose_problems
-from morgs_mi.fit.view import View
+from morgs_mi.fit.features import detect
 from morgs_mi.loop.first_frame import fit_gaussians
 from morgs_mi.stream_loop import StreamLoop
 from tests.quick import quick
@@ -47,6 +47,12 @@ def test_check_rig__does_not_check_a_camera_without_matches(capture, shared):
     )
 
 
+def test_check_rig__is_unmatched_without_any_match(capture, shared):
+    none = check_rig(capture, SharedFeatures(shared.features, ()))
+    assert none.unmatched
+    assert not check_rig(capture, shared).unmatched
+
+
 def test_check_rig__names_a_first_image_that_is_black(capture, shared):
     features = tuple(f if v != 3 else detect(None) for v, f in enumerate(shared.features))
     others = tuple(match for match in shared.matches if 3 not in match.views)
@@ -75,7 +81,7 @@ def test_check_rig__is_undecided_with_fewer_than_fifty_matches(capture, shared):
 def test_triangulate_points__ignores_the_held_out_view(capture, shared):
     points = triangulate_points(capture, shared)
     assert len(points.points) == len(points.point_colors) > 1000
-    held_out = replace(capture, test_views=(3,))
+    held_out = capture.holding_out(3)
     fewer = triangulate_points(held_out, shared)
     features = list(shared.features)
     features[3] = detect(None)
@@ -101,9 +107,7 @@ def test_match_capture__finds_features_at_the_recorded_size(capture, shared):
 
 
 def test_triangulate_points__matches_distant_views_with_their_poses(capture, shared):
-    ends = replace(
-        capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=()
-    )
+    ends = replace(capture, views=Views((capture.views[0], capture.views[5]))).holding_out(None)
     unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
     points = triangulate_points(ends, unmatched)
     assert len(points.points) > 50

@@ -1,0 +1,67 @@
+"""Points of images with known cameras: matched features, triangulated, and stereo points where
+cameras are close.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.view import View
+from morgs_mi.fit.features import Features, Match, detect, match_views, triangulate
+from morgs_mi.fit.guided_matching import match_guided
+from morgs_mi.fit.stereo import stereo_points
+
+# px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of
+# pixels.
+MAX_ERROR = 2.0
+# A view that matches fewer others without its pose is also matched with it, which takes longer.
+_MIN_PARTNERS = 3
+
+
+def image_points(views: Sequence[View], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [P, 3] that the images show, world units, and their colours [P, 3]; none
+    where nothing is matched.
+
+    Args:
+        views: V views with images of uint8.
+        rng: random generator for the selection of stereo points.
+    """
+    cameras = [view.camera for view in views]
+    features = [detect(view.image, view.mask) for view in views]
+    matches = match_views(features, cameras)
+    sparse, sparse_colors = matched_points(features, matches, cameras, range(len(views)))
+    dense, dense_colors = stereo_points(views, sparse, rng)
+    return np.concatenate([sparse, dense]), np.concatenate([sparse_colors, dense_colors])
+
+
+def matched_points(
+    features: Sequence[Features],
+    matches: Sequence[Match],
+    cameras: Sequence[Camera],
+    views: Sequence[int],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [P, 3] of matched features, world units, and their colours [P, 3].
+
+    Views with few matches are also matched by their poses.
+
+    Args:
+        features: one value per camera.
+        matches: between some of `views`, from `match_views`.
+        cameras: all cameras; only those of `views` are used.
+        views: indices of the views that are used.
+    """
+    # Unmatched pairs of views that match few others.
+    matched_pairs = {match.views for match in matches}
+    partners = Counter(view for pair in matched_pairs for view in pair)
+    few = {view for view in views if partners[view] < _MIN_PARTNERS}
+    guided = match_guided(
+        features,
+        cameras,
+        [pair for pair in combinations(views, 2) if pair not in matched_pairs and few & set(pair)],
+    )
+    return triangulate([*matches, *guided], features, cameras, MAX_ERROR)

@@ -1,0 +1,244 @@
+"""Dense points from pairs of neighbouring cameras that are close enough for stereo matching.
+
+A pair is rectified, which puts a point into the same row of both images, and matched by OpenCV's
+semi-global block matching. A point is returned if both directions of matching agree and a third
+camera that sees it shows its colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import angles_to, scene_depths, seen_points
+from morgs_mi.core.view import View
+from morgs_mi.fit.features import reduced_size
+from morgs_mi.platform.checks import valid_pixels
+
+# Images are reduced to this number of pixels: the points only initialise a fit, which is more
+# exact.
+_PIXELS = 2e5
+# Number of nearest cameras that each is matched with, and their least and largest angle, degrees.
+_NEIGHBOURS = 2
+_MIN_ANGLE = 0.5
+_MAX_ANGLE = 25.0
+# Points per pair.
+_POINTS = 4000
+# Range of searched depths, as fractions of the near and far end of the known points. With fewer
+# than this many points, the search is around the depth that the cameras look at.
+_NEAR = 0.6
+_FAR = 1.6
+_KNOWN = 10
+_BLIND = 3.0
+# px, largest difference between the disparities of both directions; largest difference of a colour.
+_MAX_DIFFERENCE = 1.0
+_MAX_COLOR = 0.08
+_BLOCK = 5
+# Least depth of a view's corners in the rectified view, for depth 1 in the camera: less is too
+# oblique.
+_LEAST_DEPTH = 0.2
+
+
+def stereo_points(
+    views: Sequence[View],
+    scene_points: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none if no cameras are
+    close.
+
+    Args:
+        views: views with images of uint8.
+        scene_points: points [K, 3] of the scene, which limit the depths.
+        rng: random generator for the selection of points.
+    """
+    cameras = [view.camera for view in views]
+    reduced = [_Reduced.of(view) for view in views]
+    batches = [np.zeros((0, 6), np.float32)]
+    depths = scene_depths(cameras, scene_points)
+    pairs = set()  # of cameras that are close enough
+    for i, camera in enumerate(cameras):
+        angles = angles_to(camera, depths[i], cameras)
+        angles[i] = np.inf
+        for j in np.argsort(angles)[:_NEIGHBOURS].tolist():
+            if _MIN_ANGLE <= angles[j] <= _MAX_ANGLE:
+                pairs.add((min(i, j), max(i, j)))
+    for i, j in sorted(pairs):
+        points = _matched(reduced[i], reduced[j], _depth_range(cameras[i], depths[i], scene_points))
+        others = [view for k, view in enumerate(reduced) if k not in (i, j)]
+        points = _some_confirmed(rng.permutation(points), others)
+        batches.append(points.astype(np.float32))
+    points, colors = np.split(np.concatenate(batches), 2, axis=1)
+    return points, colors
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """A view, reduced."""
+
+    camera: Camera  # camera of the image's size
+    image: np.ndarray  # uint8 [H, W, 3]
+    blurred: np.ndarray  # the image, averaged over 3 x 3 pixels
+    valid: np.ndarray  # uint8 [H, W], 255 where the pixel is valid
+
+    @classmethod
+    def of(cls, view: View) -> _Reduced:
+        """Return the reduced view."""
+        size = reduced_size(*view.camera.size, _PIXELS)
+        mask = valid_pixels(view.mask, view.image.shape)
+        valid = cv2.resize(255 * mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        image = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+        return cls(view.camera.resized(*size), image, cv2.blur(image, (3, 3)), valid)
+
+
+def _depth_range(camera: Camera, middle: float, scene_points: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest depth in a view, around `middle` if few are known."""
+    _, _, depths = seen_points(camera, scene_points)
+    if len(depths) >= _KNOWN:
+        near, far = np.quantile(depths, (0.02, 0.98))
+        return _NEAR * float(near), _FAR * float(far)
+    return middle / _BLIND, middle * _BLIND
+
+
+@dataclass(frozen=True)
+class _Rectified:
+    """Two views on one plane along the line between their cameras."""
+
+    axes: np.ndarray  # axes of the plane, rows right, down and forward in the world [3, 3]
+    focal: float  # focal length, px
+    baseline: float  # distance of the cameras, world units
+    # mappings from the pixels of each view to the pixels of its rectified image, for OpenCV, whose
+    # pixel centres lie at whole numbers
+    homographies: list[np.ndarray]
+    # position of each image's first column relative to the optical axis, px, and of their first row
+    corners: tuple[float, float, float]
+    size: tuple[int, int]  # width and height of both images
+
+    @classmethod
+    def of(cls, a: Camera, b: Camera) -> _Rectified | None:
+        """Return the rectification of two views, None if no plane shows both, e.g. with one camera
+        behind the other.
+        """
+        right = b.position - a.position
+        baseline = float(np.linalg.norm(right))
+        right = right / baseline
+        forward = a.viewmat[2, :3] + b.viewmat[2, :3]
+        forward = forward - forward @ right * right
+        forward /= max(float(np.linalg.norm(forward)), 1e-12)
+        axes = np.stack([right, np.cross(forward, right), forward])
+        focal = float(a.K[0, 0] + b.K[0, 0]) / 2
+        to_plane = []  # homographies from the pixels
+        corners = []  # of the images, in homogeneous pixels [4, 3]
+        for camera in (a, b):
+            H = np.diag([focal, focal, 1]) @ axes
+            H = H @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
+            places = [[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]
+            to_plane.append(H)
+            corners.append(np.array(places) @ H.T)
+        if any(rays[:, 2].min() < _LEAST_DEPTH for rays in corners):
+            return None
+        # The images have the rows that both views have.
+        (ax, ay), (bx, by) = ((rays[:, :2] / rays[:, 2:]).T for rays in corners)
+        top = max(ay.min(), by.min())
+        width = max(np.ptp(ax), np.ptp(bx))
+        size = int(np.ceil(width)), int(np.ceil(min(ay.max(), by.max()) - top))
+        starts = (ax.min(), bx.min(), top)
+        homographies = [
+            _shift(-0.5, -0.5) @ (_shift(-start, -top) @ H) @ _shift(0.5, 0.5)
+            for start, H in zip(starts, to_plane, strict=False)
+        ]
+        return cls(axes, focal, baseline, homographies, starts, size)
+
+
+def _matched(a: _Reduced, b: _Reduced, depths: tuple[float, float]) -> np.ndarray:
+    """Return the points of a pair of views and their colours [P, 6], at depths in a range."""
+    none = np.zeros((0, 6))
+    rig = _Rectified.of(a.camera, b.camera)
+    if rig is None:
+        return none
+    # The lowest disparity, and the number of disparities, of these depths.
+    product = rig.focal * rig.baseline
+    shift = rig.corners[1] - rig.corners[0]  # disparity of infinitely distant points, px
+    lowest = int(np.floor(product / depths[1] + shift))
+    steps = product / depths[0] + shift - lowest + 1
+    count = 16 * max(1, int(np.ceil(steps / 16)))
+    # Strongly converging cameras have no useful plane in common.
+    width, height = rig.size
+    if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.valid.size:
+        return none
+    left, right = map(cv2.warpPerspective, (a.image, b.image), rig.homographies, [rig.size] * 2)
+    forth = _disparity(left, right, lowest, count)
+    back = _disparity(right, left, 1 - lowest - count, count)
+    valid = [
+        cv2.warpPerspective(view.valid, H, rig.size, flags=cv2.INTER_NEAREST) > 0
+        for view, H in zip((a, b), rig.homographies, strict=True)
+    ]
+    # The pixels with a partner in the other image, which is valid and has them as its partner.
+    rows, columns = np.nonzero(valid[0] & (forth >= lowest) & (forth - shift > 0))
+    disparity = forth[rows, columns]
+    partner = np.round(columns - disparity).astype(int)
+    place = np.clip(partner, 0, width - 1)
+    agree = np.abs(disparity + back[rows, place]) <= _MAX_DIFFERENCE
+    good = agree & (partner == place) & valid[1][rows, place]
+    rows = rows[good]
+    columns = columns[good]
+    depth = product / (disparity[good] - shift)
+    x = (columns + 0.5 + rig.corners[0]) * depth / rig.focal
+    y = (rows + 0.5 + rig.corners[2]) * depth / rig.focal
+    points = np.stack([x, y, depth], axis=1) @ rig.axes + a.camera.position
+    return np.concatenate([points, left[rows, columns] / 255.0], axis=1)
+
+
+def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
+    """Return the disparity of each pixel of the left image [H, W], px, below `lowest` where there
+    is none.
+    """
+    # OpenCV leaves out the columns with partners that may lie outside the image.
+    left_pad = max(lowest + count, 0) + _BLOCK
+    right_pad = max(-lowest, 0) + _BLOCK
+    wide = [
+        cv2.copyMakeBorder(image, 0, 0, left_pad, right_pad, cv2.BORDER_CONSTANT)
+        for image in (left, right)
+    ]
+    area = 3 * _BLOCK**2
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=lowest,
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * area,
+        P2=32 * area,
+        uniquenessRatio=10,
+        speckleWindowSize=50,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    return matcher.compute(*wide)[:, left_pad:-right_pad] / 16.0
+
+
+def _some_confirmed(points: np.ndarray, others: Sequence[_Reduced]) -> np.ndarray:
+    """Return the first points [at most `_POINTS`, 6] that other views confirm; all count if there
+    are none.
+    """
+    if not others:
+        return points[:_POINTS]
+    confirmed = points[:0]
+    for start in range(0, len(points), _POINTS):
+        if len(confirmed) < _POINTS:
+            part = points[start : start + _POINTS]
+            # Points that have their colour in a valid pixel of another view.
+            good = np.zeros(len(part), bool)
+            for view in others:
+                visible, pixels, _ = seen_points(view.camera, part[:, :3])
+                columns, rows = pixels.astype(int).T
+                errors = np.abs(view.blurred[rows, columns] / 255.0 - part[visible, 3:])
+                good[visible] |= (view.valid[rows, columns] > 0) & (errors.max(axis=1) < _MAX_COLOR)
+            confirmed = np.concatenate([confirmed, part[good]])
+    return confirmed[:_POINTS]
+
+
+def _shift(x: float, y: float) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])

@@ -1,1 +1,0 @@
-"""Fits in many processes, on one machine or on a Dask cluster: chunks of a recording."""

@@ -1,0 +1,100 @@
+"""Features and matches: their places, the points behind them, and matches without a common
+geometry.
+"""
+
+import numpy as np
+
+from morgs_mi.capture.points import triangulate_points
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import seen_points
+from morgs_mi.fit.features import (
+    Features,
+    Match,
+    detect,
+    match_views,
+    reprojection_errors,
+    triangulate,
+)
+from morgs_mi.testing import assert_close
+from tests.scenes import textured
+from tests.scenes.cameras import look_at_cameras
+
+
+def test_match_views__returns_none_for_matches_without_a_common_geometry():
+    """Matches for which OpenCV's estimator of the fundamental matrix raises an error."""
+    rng = np.random.default_rng(257)
+    count = int(rng.integers(16, 24))
+    points = rng.uniform(0, 96, (count, 2)).round(1)
+    places = points + rng.normal(0, 3, (count, 2))
+    descriptors = np.eye(count, 128, dtype=np.float32)
+    features = [
+        Features(p, descriptors, np.zeros((count, 3), np.float32), places - points)
+        for p in (points, places)
+    ]
+    camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
+    assert match_views(features, [camera, camera]) == []
+
+
+def test_reprojection_errors__are_bounded_by_epipolar_distances():
+    """No point can be nearer to both features than half their distance to the epipolar lines, which
+    are the rows of cameras side by side.
+    """
+    rng = np.random.default_rng(0)
+    cameras = [look_at_cameras([(x, 0, -4)], target=(x, 0, 0))[0] for x in (0, 0.5)]
+    points = rng.uniform(-0.8, 0.8, (50, 3))
+    pixels = [camera.project(points)[0] for camera in cameras]
+    distance = rng.uniform(0, 5, 50)
+    pixels[1][:, 1] += distance
+    features = [Features(p, np.zeros((50, 128)), np.zeros((50, 3)), p) for p in pixels]
+    match = Match((0, 1), np.tile(np.arange(50)[:, None], 2))
+    errors = reprojection_errors(match, features, cameras)
+    assert (errors >= 0.45 * distance - 1e-6).all()
+    assert (errors <= 2 * distance + 1e-6).all()
+
+
+def test_detect__finds_a_blob_at_its_position():
+    """A blob at a known position, at several image sizes: pixel centres lie at +0.5."""
+    for width, height in ((160, 120), (1600, 1200)):
+        scale = width / 160
+        u = 70.3 * scale
+        v = 52.6 * scale
+        y, x = np.mgrid[:height, :width] + 0.5
+        blob = 120 + 120 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (4 * scale) ** 2))
+        points = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
+        nearest = points[np.argmin(np.linalg.norm(points - (u, v), axis=1))]
+        assert_close(nearest, (u, v), atol=0.1 * scale)
+
+
+def test_detect__respects_the_mask(textured_capture):
+    image = next(textured_capture.frames()).images[0]
+    mask = np.zeros(image.shape[:2], bool)
+    mask[:, 160:] = True
+    assert detect(image, mask).points[:, 0].min() > 158
+
+
+def test_triangulate__finds_points_on_the_planes(textured_capture, textured_features):
+    points, colors = triangulate(
+        textured_features.matches, textured_features.features, textured_capture.cameras, 2.0
+    )
+    assert points.dtype == colors.dtype == np.float32
+    assert len(points) > 1000
+    # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; a few points at occlusion
+    # edges are wrong.
+    distance = textured.distance_to_planes(points)
+    assert np.percentile(distance, 90) < 0.05
+    assert np.percentile(distance, 98) < 0.3
+    # Their colours are the colours of the pixels onto which they project.
+    image = next(textured_capture.frames()).images[2]
+    mask, pixels, _ = seen_points(textured_capture.cameras[2], points)
+    u, v = pixels.astype(int).T
+    assert np.median(np.abs(image[v, u] / 255 - colors[mask])) < 0.05
+
+
+def test_triangulate__leaves_out_points_with_a_small_angle(
+    textured_capture, textured_features, monkeypatch
+):
+    counts = []
+    for angle in (1, 20, 60):
+        monkeypatch.setattr("morgs_mi.fit.features.MIN_ANGLE", angle)
+        counts.append(len(triangulate_points(textured_capture, textured_features).points))
+    assert counts[0] > counts[1] > counts[2] == 0
