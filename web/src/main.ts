@@ -1,5 +1,6 @@
 /** The page: its controls, and what connects playback, view and drawing. */
 
+import * as THREE from "three";
 import { positionOf } from "./cameras";
 import { CONFIDENCE_GRADIENT } from "./colors";
 import { Playback } from "./playback";
@@ -20,7 +21,7 @@ const POLL = 1000;
 /** The view rests after so many milliseconds without a change. */
 const REST = 200;
 /** A note that answers to an action goes after so many milliseconds. */
-const NOTED = 3000;
+const NOTED = 5000;
 const NO_WEBGL =
   "This page needs WebGL 2, which this browser does not offer: switch on hardware acceleration in its settings, or open " +
   "the page in another browser or on another device.";
@@ -57,9 +58,13 @@ function note(topic: string, text: string): void {
 }
 
 async function begin(): Promise<void> {
-  if (document.createElement("canvas").getContext("webgl2") === null) return say(NO_WEBGL);
-  const { address, server } = element("stream").dataset;
-  const served = server === undefined ? null : new Server(address!);
+  if (document.createElement("canvas").getContext("webgl2") === null) {
+    element("player").classList.add("poster"); // without controls, which could move nothing
+    return say(NO_WEBGL);
+  }
+  const { address } = element("stream").dataset;
+  const { server } = element("player").dataset;
+  const served = server === "none" ? null : new Server(address!);
   const player = new Player(served !== null, server === "recorded");
   Object.assign(window, { player }); // for tests
   if (served !== null) await player.follow(served);
@@ -88,12 +93,26 @@ function unitOf(cameras: CameraFields[]): number {
   return 4 / (span || positions[0].length() || 4);
 }
 
+/** Return a time in words, as `duration` in morgs_mi/platform/progress.py. */
+function inWords(seconds: number): string {
+  const unit = Object.entries({ h: 3600, min: 60 }).find(([, length]) => seconds >= 1.5 * length) ?? ["s", 1];
+  return `${Math.round(seconds / unit[1])} ${unit[0]}`;
+}
+
+/** Return the corners of a box between two of them. */
+function cornersOf([low, high]: number[][]): THREE.Vector3[] {
+  const choices = Array.from({ length: 8 }, (_, i) => [i & 1, i & 2, i & 4]);
+  return choices.map((isHigh) => new THREE.Vector3().fromArray(isHigh.map((bit, axis) => (bit ? high : low)[axis])));
+}
+
 interface Metadata {
   /** Seconds since the fit began, and those of the steps of the first frame that are left; null before them. */
   provisional?: { seconds: number; left: number | null };
   config?: { render?: object };
   motion_scale?: number;
   default_rig?: boolean;
+  /** Corners of what the cameras of a default rig should show. */
+  box?: number[][] | null;
   transfer?: { display_exposure?: number };
 }
 
@@ -106,6 +125,12 @@ class Player {
   /** What the address asks for: #t=0.4&camera=left&mode=motion&pause */
   private wishes = new URLSearchParams(location.hash.slice(1));
   private started = false;
+  /** Whether the first sorted picture has replaced the poster. */
+  private revealed = false;
+  /** What the fit expects of views between its cameras, until it was said. */
+  private between = element("player").dataset.between!;
+  /** Time of the last picture. */
+  private ticked = 0;
   /** Motion that is fully saturated, as a fraction of the image's width per frame. */
   private motionScale = 0;
   /** Mode of the legend. */
@@ -142,8 +167,6 @@ class Player {
    * @param hasRecording whether it has recorded images
    */
   constructor(private readonly served: boolean, private readonly hasRecording: boolean) {
-    element("player").classList.toggle("served", served);
-    element("wipe").hidden = !hasRecording;
     this.playback = new Playback({
       opened: (stream) => this.open(stream),
       grown: ({ frames, damage }) => {
@@ -175,7 +198,7 @@ class Player {
 
   /** Whether the page shows a frame completely. */
   get settled(): boolean {
-    return this.started && !this.playback.busy && this.splats.settled && this.recorded.settled && this.exact.settled;
+    return this.revealed && !this.playback.busy && this.splats.settled && this.recorded.settled && this.exact.settled;
   }
 
   /** Show the stream of a server, also what it adds later. */
@@ -200,7 +223,7 @@ class Player {
     if (whole) {
       this.damage = null;
       this.provisional = provisional;
-      setFlag("curve", "hidden", !provisional);
+      if (!provisional) setFlag("curve", "hidden", true);
       note("provisional", provisional ? "Provisional first frame: it is still being fitted." : "");
       this.playback.open(bytes);
     } else if (this.stream === null) {
@@ -213,17 +236,18 @@ class Player {
   /** Describe the provisional first frame, with the PSNR of the selected camera over the time of the fit. */
   private async describe(count: number): Promise<void> {
     const { seconds, left } = (this.stream!.metadata as Metadata).provisional ?? { seconds: 0, left: null };
-    const rest = left === null ? "" : `, about ${Math.round(left)} s left`;
-    const text = `Provisional first frame: ${count} Gaussians after ${Math.round(seconds)} s${rest}`;
-    note("provisional", `${text}.`);
+    const rest = left === null ? "" : `, ${inWords(left)} left`;
+    const text = `Provisional first frame: ${count.toLocaleString("en")} Gaussians, ${inWords(seconds)}${rest}`;
+    note("provisional", text);
     if (!this.hasRecording) return;
     const value = await psnr(this.cameras[0], 0, this.frames[0]).catch(() => NaN);
     if (!this.provisional || !Number.isFinite(value)) return;
     this.curve.push([seconds, value]);
-    note("provisional", `${text}, ${value.toFixed(1)} dB at ${this.cameras[0].name}.`);
+    note("provisional", `${text}, ${value.toFixed(1)} dB at ${this.cameras[0].name}`);
+    setFlag("curve", "hidden", this.curve.length < 2);
     const [times, decibels] = [0, 1].map((i) => this.curve.map((point) => point[i]));
-    const least = Math.min(...decibels) - 1;
-    const height = 30 / (Math.max(...decibels) - least);
+    const least = Math.min(...decibels);
+    const height = 30 / Math.max(1, Math.max(...decibels) - least); // 1 dB or more
     const points = times.map((time, i) => `${(100 * time) / seconds},${30 - height * (decibels[i] - least)}`);
     element("curve").querySelector("polyline")!.setAttribute("points", points.join(" "));
   }
@@ -248,7 +272,7 @@ class Player {
   private setFrames(frames: number[]): void {
     this.frames = frames;
     slider.max = String(frames.length - 1);
-    element("player").classList.toggle("still", frames.length === 1);
+    if (frames.length > 1) element("player").dataset.frames = String(frames.length);
     if (this.started) this.count();
   }
 
@@ -261,30 +285,40 @@ class Player {
     this.splats = new Splats(canvas, stream.metadata, unit);
     this.splats.expose(metadata.transfer?.display_exposure ?? 0);
     const recorded = metadata.default_rig !== true;
-    this.view = new View(this.cameras, unit, canvas, recorded, recorded && !this.hasRecording, () => this.followView());
-    if (!recorded) this.bound(); // no recorded views to stay near
-    element("player").classList.toggle("recorded", recorded);
+    element("player").dataset.recorded = String(recorded);
+    const box = metadata.box ? cornersOf(metadata.box) : [];
+    this.view = new View(this.cameras, unit, canvas, element("image"), box, recorded, () => this.followView());
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
   }
 
   /** Begin with the first frame that is shown. */
   private start(): void {
     this.started = true;
-    new ResizeObserver(() => this.resize()).observe(canvas);
-    this.resize();
+    // Nothing is drawn before the camera is known: pictures sorted for another one are inside out.
     this.selectCamera(0);
+    this.resize();
     this.leaveFirst();
     this.selectMode("color");
     this.comply();
-    element("poster").hidden = true;
     this.listen();
+    const followSize = () => {
+      this.resize();
+      this.splats.draw(this.view.camera);
+    };
+    new ResizeObserver(followSize).observe(canvas);
+    requestAnimationFrame((now) => this.tick(now));
+  }
+
+  /** Show the first sorted picture in place of the poster, and begin to play. */
+  private reveal(): void {
+    this.revealed = true;
+    element("player").classList.remove("loading");
     this.lastInput = performance.now();
     if (this.wishes.has("recorded")) this.wipe(Number(this.wishes.get("recorded")));
     if (this.wishes.has("exact")) this.render();
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const paused = still || this.wishes.has("pause") || this.wishes.has("follow");
     this.playback.play(!paused && this.frames.length > 1);
-    requestAnimationFrame((now) => this.tick(now));
   }
 
   /** Do what the address asks for. */
@@ -356,8 +390,14 @@ class Player {
 
   private tick(now: number): void {
     this.playback.tick(now);
-    this.view.update();
+    this.view.update((now - this.ticked) / 1000);
+    this.ticked = now;
     this.splats.draw(this.view.camera);
+    if (this.between !== "" && this.revealed && !this.view.atCamera) {
+      this.tell(`Between the cameras: ${this.between}.`);
+      this.between = "";
+    }
+    if (!this.revealed && !this.playback.busy && this.splats.settled) this.reveal();
     if (this.legend !== this.splats.shown) this.showLegend(this.splats.shown);
     if (this.served) this.compare(now);
     element("player").classList.toggle("idle", this.playback.playing && now - this.lastInput > IDLE);
@@ -397,32 +437,21 @@ class Player {
     this.changed = performance.now();
     this.splats.setView(this.view.camera, this.view.tangent(this.motionScale));
     const { atCamera, rectangle } = this.view;
-    element("matte").hidden = !atCamera;
+    element("image").classList.toggle("matte", atCamera);
     this.splats.showBackdrop(atCamera ? rectangle : null);
-  }
-
-  /** Lay the matte and the recorded image on the camera's image. */
-  private placeImages(): void {
-    const { x, y, width, height } = this.view.rectangle;
-    for (const [name, value] of Object.entries({ x, y, width, height })) {
-      element("matte").style.setProperty(`--${name}`, `${value}px`);
-    }
   }
 
   private resize(): void {
     const { clientWidth, clientHeight } = canvas;
     if (clientWidth === 0 || clientHeight === 0) return;
     this.splats.resize(clientWidth, clientHeight, Math.min(devicePixelRatio, 2));
-    this.view.resize(clientWidth, clientHeight);
-    this.placeImages();
-    this.splats.draw(this.view.camera);
+    this.view.layOut();
   }
 
   private selectCamera(index: number): void {
     cameraList.value = String(index);
     this.splats.loadBackdrop(this.cameras[index].background);
     this.view.select(index, (camera) => this.splats.seen(camera));
-    this.placeImages();
     this.scaleDepth();
   }
 
@@ -482,13 +511,14 @@ class Player {
   }
 
   private bound(): void {
+    if (element("player").dataset.recorded === "false") return; // there are no recorded views to stay near
     this.view.bounded = !this.view.bounded;
     element("bound").ariaPressed = String(this.view.bounded);
   }
 
   /** Show the recorded image on a share of the page in percent, or no more. */
   private wipe(share = HALF): void {
-    if (element("wipe").hidden) return;
+    if (!this.hasRecording) return;
     element("wipe").ariaPressed = String(!pressed("wipe"));
     this.split(share);
     element<HTMLInputElement>("share").value = String(share);
@@ -548,7 +578,7 @@ class Player {
     // What was clicked must not take the keys.
     for (const event of ["click", "change"]) {
       element("bar").addEventListener(event, ({ target }) => {
-        if (this.byPointer && (event === "change" || target !== cameraList && target !== speedList)) canvas.focus();
+        if (this.byPointer && (event === "change" || target !== cameraList && target !== speedList)) canvas.focus({ focusVisible: false } as FocusOptions);
       });
     }
     addEventListener("keydown", (event) => this.key(event));
@@ -567,18 +597,24 @@ class Player {
       ArrowUp: () => this.view.turn(0, angle),
       ArrowDown: () => this.view.turn(0, -angle),
     };
-    const actions: Record<string, () => void> = {
+    const ofClip: Record<string, () => void> = {
       " ": () => this.toggle(),
       k: () => this.toggle(),
       ArrowLeft: () => this.step(-1),
       ArrowRight: () => this.step(1),
       Home: () => this.step(-Infinity),
       End: () => this.step(Infinity),
+      "2": () => this.selectMode("motion"),
+      "3": () => this.selectMode("confidence"),
+      "<": () => this.selectSpeed(speedList.selectedIndex - 1),
+      ">": () => this.selectSpeed(speedList.selectedIndex + 1),
+      l: () => this.repeat(),
+    };
+    const actions: Record<string, () => void> = {
+      ...(this.frames.length > 1 ? ofClip : {}),
       "+": () => this.view.zoom(1 / 1.1),
       "-": () => this.view.zoom(1.1),
       "1": () => this.selectMode("color"),
-      "2": () => this.selectMode("motion"),
-      "3": () => this.selectMode("confidence"),
       "4": () => this.selectMode("depth"),
       w: () => this.view.walk(0, 0, 1),
       s: () => this.view.walk(0, 0, -1),
@@ -591,11 +627,8 @@ class Player {
       u: () => void this.share(),
       c: () => this.selectCamera((camera + 1) % this.cameras.length),
       r: () => this.selectCamera(camera),
-      "<": () => this.selectSpeed(speedList.selectedIndex - 1),
-      ">": () => this.selectSpeed(speedList.selectedIndex + 1),
       "[": () => this.splats.expose(-0.5),
       "]": () => this.splats.expose(0.5),
-      l: () => this.repeat(),
       b: () => this.bound(),
       v: () => this.wipe(),
       x: () => this.render(),

@@ -233,7 +233,9 @@ export class Splats {
 
   /** Whether the image shows all that was applied, in the right order. */
   get settled(): boolean {
-    return !this.changed && !this.spark.sorting && !this.spark.sortDirty && this.shown === this.mode;
+    const { sorting, sortDirty, orderingTexture, updateTimeoutId } = this.spark;
+    const sorted = orderingTexture !== null && !sorting && !sortDirty && updateTimeoutId === -1;
+    return sorted && !this.changed && this.shown === this.mode;
   }
 
   seen(camera: THREE.PerspectiveCamera): Seen[] {

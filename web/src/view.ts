@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { axisOf, fovOf, positionOf, turntableUp } from "./cameras";
+import { axisOf, positionOf, turntableUp } from "./cameras";
 import { quantile, type Seen } from "./mesh";
 import type { CameraFields } from "./stream";
 
@@ -12,18 +12,15 @@ import type { CameraFields } from "./stream";
  * of it, because a fit of few views falls apart sooner.
  */
 const REACH = THREE.MathUtils.degToRad(8);
-/** Share of the angle beyond it by which a frame turns the view back. */
-const PULL = 0.5;
+/** Seconds in which the view turns back by half of the angle beyond it. */
+const HALVED = 1 / 60;
 /** Distance, in units of the page, and angle up to which the view is at a camera: rounding of the controls. */
 const AT_CAMERA = 1e-4;
 
-/** Share of the Gaussians of a file on each side that may lie outside of the first view, and the margin around the others. */
-const OUTSIDE = 0.025;
-const MARGIN = 1.15;
 /** Share of the distance to what the view orbits around by which a key moves it. */
 const STRIDE = 0.06;
 
-/** A rectangle: of a camera's image in its pixels, or of the page. */
+/** A rectangle on the page, pixels. */
 export interface Rectangle {
   x: number;
   y: number;
@@ -39,30 +36,27 @@ export interface Place {
 
 export class View {
   readonly camera = new THREE.PerspectiveCamera();
-  /** Whether orbits are drawn back to the directions of the rig's cameras. */
-  bounded = true;
+  /** Where the whole image of the selected camera lies on the page. */
+  rectangle: Rectangle = { x: 0, y: 0, width: 1, height: 1 };
   private controls: OrbitControls | null = null;
   private current: CameraFields;
   /** Pose of the view at the selected camera. */
   private readonly home = new THREE.Object3D();
-  /** Part of the selected camera's image that fills the page; null: all of it. */
-  private subject: Rectangle | null = null;
-  /** Where things move in its image, horizontally, pixels. */
-  private motion = 0;
-  private size = { width: 1, height: 1 };
   /** Positions of the rig's cameras. */
   private readonly positions: THREE.Vector3[];
 
   /**
-   * @param recorded whether the cameras were recorded; those around a file frame its Gaussians
-   * @param crops whether the image of a recorded camera covers an upright page
+   * @param image element that the style of the page lays where the image of the selected camera is
+   * @param box corners of what cameras that were not recorded should show, world units
+   * @param bounded whether orbits are drawn back to the directions of the rig's cameras
    */
   constructor(
     private readonly cameras: CameraFields[],
     private readonly unit: number,
     private readonly element: HTMLElement,
-    private readonly recorded: boolean,
-    private readonly crops: boolean,
+    private readonly image: HTMLElement,
+    private readonly box: THREE.Vector3[],
+    public bounded: boolean,
     private readonly onChange: () => void,
   ) {
     this.current = cameras[0];
@@ -75,9 +69,6 @@ export class View {
    */
   select(index: number, seen: (camera: THREE.PerspectiveCamera) => Seen[]): void {
     this.current = this.cameras[index];
-    const { width, height } = this.current;
-    this.subject = { x: 0, y: 0, width, height };
-    this.motion = width / 2;
     const { camera, unit } = this;
     const ahead = axisOf(this.current, 2);
     camera.position.copy(positionOf(this.current)).multiplyScalar(unit);
@@ -85,10 +76,10 @@ export class View {
     camera.far = 1e5;
     camera.up.copy(turntableUp(this.current, this.cameras));
     camera.lookAt(ahead.clone().add(camera.position));
-    this.project();
+    this.project({ x: 0, y: 0, ...this.size }); // the image fills the page
     const places = seen(camera);
     this.compose(places);
-    this.project();
+    this.layOut();
     this.controls?.dispose();
     this.controls = new OrbitControls(camera, this.element);
     this.controls.target.copy(camera.position).addScaledVector(ahead, quantile(places.map(({ depth }) => depth)) ?? 1);
@@ -102,43 +93,24 @@ export class View {
     this.onChange();
   }
 
-  /** Frame the Gaussians of a file, or place the image of a recorded camera on an upright page. */
+  /** Describe to the style what the page shows of the image: all of it, or the box, and where things move. */
   private compose(places: Seen[]): void {
-    const { x, y, width, height } = this.rectangle;
-    this.subject = null;
-    const toImage = (place: number, start: number, length: number, page: number) =>
-      ((((place + 1) / 2) * page - start) / length);
-    const xs = (some: Seen[]) =>
-      some.map((place) => this.current.width * toImage(place.x, x, width, this.size.width));
-    const ys = places.map((place) => this.current.height * toImage(-place.y, y, height, this.size.height));
-    if (this.recorded) {
-      this.motion = quantile(xs(places.filter(({ moves }) => moves))) ?? this.motion;
-    } else if (places.length > 0) {
-      const [left, right] = [OUTSIDE, 1 - OUTSIDE].map((fraction) => quantile(xs(places), fraction)!);
-      const [top, bottom] = [OUTSIDE, 1 - OUTSIDE].map((fraction) => quantile(ys, fraction)!);
-      const [w, h] = [MARGIN * (right - left), MARGIN * (bottom - top)];
-      if (w > 0 && h > 0) this.subject = { x: (left + right - w) / 2, y: (top + bottom - h) / 2, width: w, height: h };
-    }
+    const { width, height } = this.current;
+    const across = (x: number) => ((1 + x) / 2) * width;
+    const down = (y: number) => ((1 - y) / 2) * height;
+    const corners = this.box.map((corner) => corner.clone().multiplyScalar(this.unit).project(this.camera));
+    const xs = this.box.length > 0 ? corners.map(({ x }) => across(x)) : [0, width];
+    const ys = this.box.length > 0 ? corners.map(({ y }) => down(y)) : [0, height];
+    const [x, y] = [Math.min(...xs), Math.min(...ys)];
+    const motion = quantile(places.filter(({ moves }) => moves).map((place) => across(place.x))) ?? width / 2;
+    const shown = { x, y, width: Math.max(...xs) - x, height: Math.max(...ys) - y };
+    const values = { "image-width": width, "image-height": height, ...shown, motion };
+    for (const [name, value] of Object.entries(values)) this.image.style.setProperty(`--${name}`, String(value));
   }
 
-  /** The part of the camera's image that fills the page. */
-  private get frame(): Rectangle {
-    const { width: w, height: h } = this.current;
-    if (this.subject !== null) return this.subject;
-    const visible = (h * this.size.width) / this.size.height;
-    if (!this.crops || this.size.width > this.size.height || visible > w) return { x: 0, y: 0, width: w, height: h };
-    return { x: Math.max(0, Math.min(w - visible, this.motion - visible / 2)), y: 0, width: visible, height: h };
-  }
-
-  /** Where the camera's whole image lies on the page. */
-  get rectangle(): Rectangle {
-    const { frame, scale, size, current } = this;
-    return {
-      x: size.width / 2 - scale * (frame.x + frame.width / 2),
-      y: size.height / 2 - scale * (frame.y + frame.height / 2),
-      width: scale * current.width,
-      height: scale * current.height,
-    };
+  /** Size of the page, pixels. */
+  private get size() {
+    return { width: this.element.clientWidth, height: this.element.clientHeight };
   }
 
   /** Where the view is. */
@@ -182,20 +154,18 @@ export class View {
   /** The view as a camera with an image of a size in pixels. */
   fields(width: number, height: number): CameraFields {
     const { K, near } = this.current;
-    const { size, unit } = this;
+    const { size, unit, rectangle, scale } = this;
     this.camera.updateMatrixWorld();
     const m = this.camera.matrixWorldInverse.elements;
     const [right, up, back] = [0, 1, 2].map((i) => [m[i], m[4 + i], m[8 + i], m[12 + i] / unit]);
     const flipped = (row: number[]) => row.map((value) => -value);
     const [x, y] = [width / size.width, height / size.height];
-    const { scale } = this;
-    const [cx, cy] = this.offset;
     // prettier-ignore
     return {
       name: "page",
       K: [
-        [x * scale * K[0][0], 0, width / 2 + x * scale * cx],
-        [0, y * scale * K[1][1], height / 2 + y * scale * cy],
+        [x * scale * K[0][0], 0, x * (rectangle.x + scale * K[0][2])],
+        [0, y * scale * K[1][1], y * (rectangle.y + scale * K[1][2])],
         [0, 0, 1],
       ],
       viewmat: [right, flipped(up), flipped(back), [0, 0, 0, 1]],
@@ -203,21 +173,25 @@ export class View {
     };
   }
 
-  resize(width: number, height: number): void {
-    this.size = { width, height };
-    this.project();
+  /** Follow the size of the page, and the place of the image on it. */
+  layOut(): void {
+    this.rectangle = this.image.getBoundingClientRect();
+    this.project(this.rectangle);
     this.onChange();
   }
 
-  /** Continue a movement that slows down, and draw an orbit back that has left the rig. */
-  update(): void {
+  /** Continue a movement that slows down, and draw an orbit back that has left the rig, for some seconds. */
+  update(seconds: number): void {
     if (this.controls === null) return;
     this.controls.update();
-    if (this.bounded) this.drawBack(this.controls);
+    if (this.bounded) this.drawBack(this.controls, 1 - 0.5 ** (seconds / HALVED));
   }
 
-  /** Turn towards the nearest camera of the rig, as seen from what the view orbits around, where it is too far away. */
-  private drawBack(controls: OrbitControls): void {
+  /**
+   * Turn towards the nearest camera of the rig, as seen from what the view orbits around, where it is too far away, by a
+   * share of the angle beyond.
+   */
+  private drawBack(controls: OrbitControls, share: number): void {
     const { target } = controls;
     const offset = this.camera.position.clone().sub(target);
     const directions = this.positions.map((position) => position.clone().sub(target));
@@ -227,7 +201,7 @@ export class View {
     const around = directions.filter((direction) => direction.angleTo(nearest) < 2 * REACH); // itself included
     const beyond = angle - (around.length > 1 ? REACH : REACH / 2);
     if (beyond < 1e-3) return;
-    offset.applyAxisAngle(offset.clone().cross(nearest).normalize(), PULL * beyond);
+    offset.applyAxisAngle(offset.clone().cross(nearest).normalize(), share * beyond);
     this.camera.position.copy(target).add(offset);
     controls.update();
   }
@@ -259,31 +233,25 @@ export class View {
 
   /** Pixels of the page per pixel of the camera's image. */
   private get scale(): number {
-    return Math.min(this.size.width / this.frame.width, this.size.height / this.frame.height);
+    return this.rectangle.width / this.current.width;
   }
 
-  /** Principal point from the middle of what fills the page, pixels of the camera's image. */
-  private get offset(): number[] {
+  /** Project the image of the selected camera onto a rectangle of the page; more is visible around it. */
+  private project({ x, y, width, height }: Rectangle): void {
     const { K } = this.current;
-    const { x, y, width, height } = this.frame;
-    return [K[0][2] - x - width / 2, K[1][2] - y - height / 2];
-  }
-
-  /** Fit the part of the camera's image into the page: all of it is visible, and more beside it. */
-  private project(): void {
-    const { K } = this.current;
-    const { width, height } = this.size;
-    const { camera, scale } = this;
-    const [cx, cy] = this.offset;
+    const page = this.size;
+    const { camera } = this;
+    const [scaleX, scaleY] = [width / this.current.width, height / this.current.height];
     const { near, far } = camera;
     // prettier-ignore
     camera.projectionMatrix.set(
-      (2 * K[0][0] * scale) / width, 0, (-2 * cx * scale) / width, 0,
-      0, (2 * K[1][1] * scale) / height, (2 * cy * scale) / height, 0,
+      (2 * K[0][0] * scaleX) / page.width, 0, 1 - (2 * (x + scaleX * K[0][2])) / page.width, 0,
+      0, (2 * K[1][1] * scaleY) / page.height, (2 * (y + scaleY * K[1][2])) / page.height - 1, 0,
       0, 0, (near + far) / (near - far), (2 * far * near) / (near - far),
       0, 0, -1, 0,
     );
     camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
-    camera.fov = fovOf(this.current, width / height); // for the speed of panning
+    // For the speed of panning.
+    camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(page.height / (2 * K[1][1] * scaleY)));
   }
 }
