@@ -36,7 +36,7 @@ def main() -> None:
         capture = morgs_mi.load_capture(Path(folder, "clip"))
         fit = morgs_mi.FitConfig(num_gaussians=6000, first_frame_steps=600)
         loop = morgs_mi.StreamLoop.of(capture, morgs_mi.StreamConfig(fit=fit))
-        loop.push([next(capture.frames()).images[v] for v in capture.train_views])
+        loop.push(next(capture.frames()).train)
     assert loop.gaussians is not None
     images = rendered(loop.gaussians, capture.cameras[capture.reference_view], _RAYS)
     print(f"{_OUT}: {write_picture(_OUT, images):.1f} dB")

@@ -13,7 +13,7 @@ Without a fit, its picture is left as it is; the demo's clip is made. All stages
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,9 +27,10 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.evaluate.comparison import ComparedClip
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.extras.demo.demo import DemoConfig
+from morgs_mi.extras.synth.demo import DemoConfig
 from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.video import VideoReader
+from morgs_mi.loop.input_images import FrameImages
 from morgs_mi.loop.observation import FrameObservation, observe_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.lift import lift_flow
@@ -71,9 +72,7 @@ def main() -> None:
         synthesize(config.scene, _CAPTURE, replace(config.clip, seed=config.stream.seed))
     capture = morgs_mi.load_capture(_CAPTURE)
     loop = StreamLoop.of(capture, config.stream)
-    frames = [
-        [frame.images[v] for v in capture.train_views] for frame in capture.frames(0, _FRAME + 1)
-    ]
+    frames = [frame.train for frame in capture.frames(0, _FRAME + 1)]
     for images in frames[:-1]:
         loop.push(images)
     _OUT.mkdir(parents=True, exist_ok=True)
@@ -106,7 +105,7 @@ def compared(clip: ComparedClip) -> Iterable[np.ndarray]:
         )
 
 
-def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
+def draw(loop: StreamLoop, images: FrameImages) -> dict[str, np.ndarray]:
     """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes
     most, by name.
     """
@@ -131,16 +130,17 @@ def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.
     picture = _channel(new_gaussians, camera, "color")
     # Fully saturated at a speed that the fastest pixels reach.
     scale = float(np.percentile(np.linalg.norm(flow.motion[flow.mask], axis=-1), 95))
-    flow_image = np.where(flow.reliable[..., None], flow.motion, np.nan)
+    flow_image = np.where(flow.reliable[..., None], flow.motion, 0)
     lifted_motion = _channel(lifted_gaussians, camera, "motion")
+    new_motion = _channel(new_gaussians, camera, "motion")
     share = _changed_share(state.coded, state_after, camera)
     return {
         "image": image,
         "changes": to_uint8(changes[view].astype(float)),
-        "flow": explained_image("motion", flow_image, scale, "flow"),
+        "flow": explained_image("motion", flow_image, scale, "flow", image),
         "mask": to_uint8(flow.mask.astype(float)),
-        "lifted": explained_image("motion", lifted_motion, scale, "lifted flow"),
-        "motion": explained_image("motion", _channel(new_gaussians, camera, "motion"), scale),
+        "lifted": explained_image("motion", lifted_motion, scale, "lifted flow", picture),
+        "motion": explained_image("motion", new_motion, scale, color=picture),
         "confidence": explained_image("confidence", _channel(new_gaussians, camera, "confidence")),
         "residual": explained_image("confidence", share, title="share"),
         "render": to_uint8(np.clip(picture, 0, 1)),

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from benchmarks.field.shared import corners
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import (
     MOTION_MODELS,

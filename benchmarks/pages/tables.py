@@ -16,11 +16,12 @@ from benchmarks.reports import (
     random_scenes,
     renderer,
     stability,
+    starts,
     timing,
 )
 from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import markdown
-from benchmarks.speed import stages
+from benchmarks.speed import host, stages
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -203,6 +204,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(
         committed("held_out")["fits"], committed("held_out_seeds")["fits"]
     ),
+    "host": lambda: host.sizes_table(committed("host")["sizes"]),
     "parts": parts,
     "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
@@ -218,5 +220,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
             ("sets", needed.sets_table),
         )
     },
+    "starts": partial(study_table, starts, "starts", "starts_far"),
     "unseen": partial(study_table, random_scenes, "random_scenes"),
 }

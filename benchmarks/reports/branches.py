@@ -22,12 +22,12 @@ from unittest.mock import patch
 import numpy as np
 
 from morgs_mi.core.attributes import BY_NAME
-from morgs_mi.core.config import apply_values
 from morgs_mi.fit import initialise
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method import active_set, exposure, lift, motion
+from morgs_mi.method import active_set, exposure, lift
 from morgs_mi.method.exposure import Exposure
+from morgs_mi.platform.config import apply_values
 
 # Width of the clips on which the settings were chosen, px.
 _TUNED_WIDTH = 320
@@ -45,6 +45,10 @@ class PerWidth:
     def at(self, width: int) -> float:
         """Return the length in an image of a width, both in px."""
         return self.pixels * width / _TUNED_WIDTH
+
+
+GONE: Mapping[str, Any] = {}
+"""Switches of a branch that went: its fits, of code that had it, stay in the table."""
 
 
 @dataclass(frozen=True)
@@ -90,23 +94,9 @@ def groups() -> tuple[str, ...]:
     return tuple(dict.fromkeys(branch.group for branch in BRANCHES))
 
 
-def _starts_without(stage: str) -> dict[str, Any]:
-    """Return the stages that start the motion, one of which knows no motion of the frame before."""
-    stages = dict(motion.STARTS)
-    inner = stages[stage]
-
-    def without_last(problem: Any, start: Any, config: Any) -> Any:
-        still = np.zeros((len(problem.gaussians), 3), np.float32)
-        gaussians = replace(problem.gaussians, motion=still)
-        return inner(replace(problem, gaussians=gaussians), start, config)
-
-    return {**stages, stage: without_last}
-
-
 # The functions that neutral ones call, before they are replaced.
 _RATES_AT = FitConfig.rates_at
 _LINE = exposure._line
-_FLOWS = lift._Flows
 _RESPONSIBILITY = active_set.responsibility
 _RESAMPLE = initialise.resample_points
 
@@ -115,9 +105,8 @@ def _everywhere(mask: np.ndarray) -> tuple[slice, slice] | None:
     return (slice(0, mask.shape[0]), slice(0, mask.shape[1])) if mask.any() else None
 
 
-def _moving_logits(flows: Any, d: np.ndarray) -> np.ndarray:
-    speed = np.linalg.norm(flows.project(d), axis=-1)
-    return np.where(np.any(speed > flows.floor, axis=0), lift.MAX_LOGIT, -lift.MAX_LOGIT)
+def _any_motion(flows: Any, d: np.ndarray) -> np.ndarray:
+    return np.any(np.linalg.norm(flows.project(d), axis=-1) > lift._NOISE_PX, axis=0)
 
 
 _FREE_ROTATION = {**BY_NAME, "quats": replace(BY_NAME["quats"], gate="appearance")}
@@ -165,7 +154,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(
         _FOLLOWED,
         "exposure of later frames",
-        {"loop.observation:follow_exposure": lambda *_: Exposure()},
+        {"loop.observation:fit_exposure": lambda *_: Exposure()},
     ),
     Branch(
         _FOLLOWED,
@@ -245,28 +234,16 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_STARTS, "refinement", {"motion.refine_start": False}),
     # method.lift
     Branch(_LIFT, "agreement of the views", {"method.lift:_ROUNDS": 0}),
-    Branch(
-        _LIFT,
-        "variance of the flow",
-        {
-            "method.lift:_Flows": lambda weight, flow, variance, *rest: _FLOWS(
-                weight, flow, 0 * variance, *rest
-            )
-        },
-    ),
+    Branch(_LIFT, "variance of the flow", GONE),
     Branch(_LIFT, "prior of no motion", {"method.lift:_PRIOR_PIXELS": _LEAST}),
     Branch(_LIFT, "noise that grows with motion", {"method.lift:_NOISE_FRACTION": 0.0}),
     Branch(_LIFT, "weight of hardly covered views", {"method.lift:_HALF_WEIGHT_PIXELS": _LEAST}),
-    Branch(_LIFT, "evidence of motion", {"method.lift:_logits": _moving_logits}),
-    Branch(_LIFT, "soft confidence", {"method.lift:_CONFIDENCE_SLOPE": 1e3}),
-    Branch(_LIFT, "least motion", {"method.lift:motion_floor": lambda *_: 0.0}),
+    Branch(_LIFT, "evidence of motion", {"method.lift:_evidence": _any_motion}),
+    Branch(_LIFT, "soft confidence", GONE),
+    Branch(_LIFT, "least motion", GONE),
     # method.motion, method.sweep
     Branch(_PROPOSALS, "proposals from neighbours", {"method.motion:_ROUNDS": 0}),
-    Branch(
-        _PROPOSALS,
-        "proposals from the frame before",
-        {"method.motion:STARTS": _starts_without("propagate_motion")},
-    ),
+    Branch(_PROPOSALS, "proposals from the frame before", GONE),
     Branch(
         _PROPOSALS,
         "clear gain of a proposal",
@@ -300,13 +277,9 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_CONFIDENCE, "gate of rotations", {"method.residual:BY_NAME": _FREE_ROTATION}),
     Branch(_CONFIDENCE, "confidence by lifted flow", {"motion.lift_confidence": False}),
     Branch(_CONFIDENCE, "cohesion", {"motion.cohesion_weight": 0.0}),
-    Branch(_CONFIDENCE, "colour in cohesion", {"method.cohesion:_CHROMA_SCALE": float(_ALL)}),
+    Branch(_CONFIDENCE, "colour in cohesion", GONE),
     Branch(_CONFIDENCE, "far cohesion", {"method.cohesion:ROUNDS": 10}),
-    Branch(
-        _CONFIDENCE,
-        "confidence of the frame before",
-        {"method.motion:_CONFIDENCE_DECAY": float(_ALL)},
-    ),
+    Branch(_CONFIDENCE, "confidence of the frame before", GONE),
     Branch(_CONFIDENCE, "start at full length behind the gate", {"method.residual:_MIN_GATE": 1.0}),
     # method.mask_refiners, loop.first_frame
     Branch(
@@ -333,14 +306,10 @@ BRANCHES: tuple[Branch, ...] = (
         },
     ),
     Branch(_RATES, "momentum by epochs", {"fit.fit_config:FitConfig.momentum": 0.9}),
-    Branch(_RATES, "early end of a frame", {"fit.early_stopping_tolerance": 0.0}),
+    Branch(_RATES, "early end of a frame", GONE),
     # fit.density, method.error_per_gaussian
     Branch(_ADDITIONS, "density of later frames", {"fit.density.later_frames": False}),
-    Branch(
-        _ADDITIONS,
-        "round before the last epochs",
-        {"fit.later_frame:_LATEST_DENSITY_ROUND": 1.0},
-    ),
+    Branch(_ADDITIONS, "round before the last epochs", GONE),
     Branch(_ADDITIONS, "errors that are noise", {"method.error_per_gaussian:NOISE": 0.0}),
     Branch(_ADDITIONS, "least error of a parent", {"fit.density.min_error": 0.0}),
     Branch(_ADDITIONS, "smaller births", {"fit.density:_LOG_SHRINK": 0.0}, True),
@@ -364,9 +333,7 @@ BRANCHES: tuple[Branch, ...] = (
         },
         True,
     ),
-    Branch(
-        _POINTS, "random points where views show none", {"fit.initialise:_MANY_POINTS": 0}, True
-    ),
+    Branch(_POINTS, "random points where views show none", {"fit.initialise:MANY_POINTS": 0}, True),
     Branch(_POINTS, "spread of their depths", {"fit.initialise:_SPREAD": 0.0}, True),
     Branch(
         _POINTS,

@@ -39,7 +39,7 @@ from morgs_mi.extras.calibration.refine import refine_cameras, register_camera
 from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.fit.view import mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 
 _FOCAL_ERROR = 0.01
@@ -149,14 +149,13 @@ def rotation_error(rig: Capture, true: Capture) -> float:
 def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     """Fit the first frame; return the PSNR of the held-out view in both ways."""
     loop = new_loop(capture, config)
-    images = next(capture.frames(0, 1)).images
-    loop.push([images[v] for v in capture.train_views])
+    frame = next(capture.frames(0, 1))
+    loop.push(frame.train)
     gaussians = loop.gaussians
-    test = capture.reference_view
     assert gaussians is not None
-    view = View(capture.cameras[test], images[test], capture.masks[test])
+    view = frame.views[capture.reference_view]
     camera = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
-    views = {"calibrated": view, "registered": view._replace(camera=camera)}
+    views = {"calibrated": view, "registered": replace(view, camera=camera)}
     return {name: mean_psnr(gaussians, [each], config.render) for name, each in views.items()}
 
 
@@ -173,7 +172,7 @@ def measure(
         config: settings.
     """
     if degrees:
-        wrong = replace(wrong, cameras=disturbed(wrong.cameras, degrees, disturbance))
+        wrong = wrong.with_cameras(disturbed(wrong.cameras, degrees, disturbance))
     better, refinement = refine_cameras(wrong, config.fit, config.render, config.seed)
     return {
         "true": scores(capture, config),

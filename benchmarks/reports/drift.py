@@ -71,8 +71,7 @@ def measure(capture: Capture, num_frames: int, config: StreamConfig) -> dict[str
     """
     loop = new_loop(capture, config)
     frames = capture.partial_frames(0, num_frames)
-    images = next(frames).images
-    loop.push([images[v] for v in capture.train_views])
+    loop.push(next(frames).train)
     rows = list(fitted_frames(loop, capture, frames))
     series = {name: [row[name] for row in rows] for name in rows[0]}
     moving = np.array(series["psnr_moving"])

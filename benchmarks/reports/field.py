@@ -20,28 +20,45 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
+from benchmarks.field import anchors, hicom, motion_grid, rigidity, transformation_cache  # noqa: F401, they register models and terms
 from benchmarks.reports.fits import DEFAULT, Clip, new_loop, random_capture
 from benchmarks.reports.plots import Column, blank_figure, means_over, save_figure, scores_table
 from benchmarks.reports.tracks import track_scores
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.core.config import apply_values
-from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
+from morgs_mi.platform.config import apply_values
+from morgs_mi.platform.files import json_finite
 
 _FAST = {"fit": {"rates": {"means": 2e-3}}}
-_RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
+_RIGID = {"terms": ("rigid:0.4", "rotation:0.4", "isometry:0.2")}
+# Motion with constant velocity as the start, and an appearance that stays as it is.
+_RIGIDITY: dict[str, Any] = {
+    "fit": {
+        "objective": _RIGID,
+        "density": {"later_frames": False},
+        "decay_means_rate": False,
+        "rates": {
+            "means": 4e-3,
+            "quats": 0.02,
+            "scales": 0.0,
+            "opacities": 0.0,
+            "sh_dc": 0.0,
+            "sh_rest": 0.0,
+        },
+    },
+    "motion": {"constant_velocity": True},
+}
 # Presets and further settings by name, in the order of the tables; DEFAULT is no preset. The motion
-# models register themselves where they are imported.
+# models and the rigid terms register themselves where they are imported.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "baseline": ("baseline", {}),
     # Of the means, tuned like the rates of the other methods.
     "baseline, 4x rate": ("baseline", _FAST),
     "hicom": ("baseline", {"motion": {"model": "hicom"}}),
-    "rigidity": ("rigidity", {}),
+    "rigidity": ("baseline", _RIGIDITY),
     "cache": ("baseline", {"motion": {"model": "cache"}}),
     "grid": ("baseline", {"motion": {"model": "grid"}}),
     "anchors": ("baseline", {"motion": {"model": "anchors"}}),

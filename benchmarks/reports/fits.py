@@ -82,10 +82,7 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
 
 def new_loop(capture: Capture, config: StreamConfig) -> StreamLoop:
     """Return a loop over the training views of a capture."""
-    train = capture.train_views
-    cameras = [capture.cameras[v] for v in train]
-    masks = [capture.masks[v] for v in train]
-    return StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
+    return StreamLoop(capture.views.train, capture.points, capture.point_colors, config)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +96,7 @@ class Clip:
     def read(cls, capture: Capture) -> Clip:
         """Return a capture with its images decoded."""
         frames = capture.frames()
-        return cls(capture, tuple(tuple(f.images[v] for v in capture.train_views) for f in frames))
+        return cls(capture, tuple(tuple(view.image for view in f.train) for f in frames))
 
     def continued(self, keyframe: Packet, config: StreamConfig) -> Continuation:
         """Fit all later frames after the packet of the first one."""

@@ -20,7 +20,7 @@ import tyro
 
 from benchmarks.reports.plots import markdown
 from benchmarks.speed.output import Output
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 
 # Frames of a table over time at equal distances, besides the first residual.
 _ROWS = 3

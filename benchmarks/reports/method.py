@@ -30,13 +30,13 @@ from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.codec.container import Packet
-from morgs_mi.core.files import json_finite
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.platform.files import json_finite
 
 # Rows of the paper's table of key views.
 _WITHOUT_OFFSET = "ml"
@@ -136,7 +136,9 @@ def variants_of(options: Options, num_views: int) -> tuple[list[Variant], list[V
         keys = {"preset": preset, "epochs": epochs, "key_views": key_views, "rates": rates}
         return Variant(keys, settings_of(options.base, **keys))
 
-    usual = min(options.stream.motion.key_views, num_views)
+    usual = options.stream.motion.key_views
+    assert isinstance(usual, int)
+    usual = min(usual, num_views)
     presets = [
         variant(preset, epochs, usual, rates)
         for epochs in options.epochs

@@ -47,16 +47,16 @@ from benchmarks.reports.trial_rule import (
 from benchmarks.speed.output import Output, commit
 from morgs_mi import Gaussians, StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
-from morgs_mi.core.bounded import read_json
-from morgs_mi.core.checks import quantity
-from morgs_mi.core.config import apply_values
-from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import write_json
-from morgs_mi.core.progress import Progress
 from morgs_mi.evaluate.metrics import endpoint_error, psnr, recorded_change
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.config import apply_values
+from morgs_mi.platform.environment import machine, versions
+from morgs_mi.platform.files import write_json
+from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.stream_header import truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.runs.fit_capture import push_frame, with_points
@@ -87,7 +87,7 @@ class Recording:
         """The names of the branches that act on it, group by group; those last that act on the
         first frame, whose fits take longest.
         """
-        members = [[b for b in BRANCHES if b.group == group] for group in groups()]
+        members = [[b for b in BRANCHES if b.group == group and b.switches] for group in groups()]
         members.sort(key=lambda group: any(branch.in_first for branch in group))
         return [[branch.name for branch in group if acts_on(branch, self)] for group in members]
 
@@ -103,6 +103,7 @@ RECORDINGS = {
     "demo": Recording(4, 2, settings=_CHEAP),
     "random-41": Recording(4, settings=_CHEAP, seed=41),
     "random-42": Recording(4, settings=_CHEAP, seed=42),
+    "demo-12": Recording(12, 2, settings={"fit": _SMALL}),
     "basketball": Recording(4, hold_out=(0, 10, 15, 30), settings=_RECORDED),
     "walk4": Recording(3, 4, (1,), {"motion": {"mask_interval": 2}}),
     "flame_steak": Recording(1, 2),
@@ -234,7 +235,7 @@ class Opened:
         """Fit the next frame of a loop, and return its scores; `last` is the frame before."""
         wall = time.perf_counter()
         cpu = time.process_time()
-        packet, report = push_frame(loop, frame, self.capture.train_views)
+        packet, report = push_frame(loop, frame)
         scores = {
             "seconds": time.perf_counter() - wall,
             "cpu_s": time.process_time() - cpu,
@@ -266,8 +267,7 @@ def measure(opened: Opened, off: Sequence[str], seed: int) -> dict[str, Any]:
             first_scores = opened.pushed(loop, first)
         else:
             assert start.state.coded is not None
-            images = first.comparable(capture.train_views)
-            loop.resume(start.state.coded, [images], start.state.exposures)
+            loop.resume(start.state.coded, [first.comparable], start.state.exposures)
         pairs = zip(later_frames, opened.frames, strict=False)
         rows = [opened.pushed(loop, frame, last) for frame, last in pairs]
     return summary([first_scores, *rows])
@@ -278,15 +278,16 @@ def scores_of(
 ) -> dict[str, float]:
     """Return the mean scores of the held-out views of a frame; `last` is the frame before."""
     views = []
-    for view in capture.test_views:
-        camera = capture.cameras[view]
-        image = frame.images[view]
-        if image is None:
+    for v in capture.test_views:
+        view = frame.views[v]
+        if not view.has_image:
             continue
+        camera = view.camera
+        image = view.image
         maps = rasterize(gaussians, camera, ("color", "motion"))
         rendered = to_uint8(np.asarray(maps.color))
-        scores = {"psnr": psnr(rendered, image, capture.masks[view])}
-        last_image = None if last is None else last.images[view]
+        scores = {"psnr": psnr(rendered, image, view.mask)}
+        last_image = None if last is None else last.images[v]
         truth = truth_for_camera(capture, camera, frame.index)
         if last_image is not None:
             moving = recorded_change(last_image, image) if truth is None else truth.mask
@@ -335,6 +336,7 @@ def branches_table(rows: Sequence[Mapping[str, Any]]) -> str:
         places = [name for name, recording in RECORDINGS.items() if acts_on(branch, recording)]
         word, place, trial = verdict(trials, branch.name, places)
         switches = ", ".join(f"`{name.replace(':', '.')}`" for name in branch.switches)
+        word = word if switches else "gone"
         lines.append((branch.group, branch.name, switches, word, reason(place, trial)))
     titles = "group", "branch", "place", "verdict", "largest loss without it"
     return markdown(titles, lines, left=5)

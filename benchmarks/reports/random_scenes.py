@@ -70,7 +70,7 @@ def measure(capture: Capture, num_frames: int, config: StreamConfig) -> dict[str
     """Fit a clip and return the means of the scores of its later frames."""
     first, *later_frames = capture.partial_frames(0, num_frames)
     loop = new_loop(capture, config)
-    loop.push([first.images[v] for v in capture.train_views])
+    loop.push(first.train)
     rows = list(fitted_frames(loop, capture, later_frames))
     return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
 
@@ -84,7 +84,7 @@ def fitted_frames(
     test = capture.reference_view
     for frame in frames:
         start = time.process_time()
-        _, report = loop.push([frame.images[v] for v in capture.train_views])
+        _, report = loop.push(frame.train)
         seconds = time.process_time() - start
         image = frame.images[test]
         if image is not None and loop.gaussians is not None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,12 @@ from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.progress import Progress
+from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.refine import register_camera
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.fit.view import mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.visualise import label, side_by_side
 from morgs_mi.runs.fit_capture import with_points
 
@@ -103,13 +104,12 @@ def measure(capture: Capture, pictures: Path | None, config: StreamConfig) -> di
     both ways.
     """
     capture = with_points(capture, config.seed, Progress())
-    images = next(capture.frames(0, 1)).images
-    views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
-    train = [views[v] for v in capture.train_views]
-    test = [views[v] for v in capture.test_views]
+    frame = next(capture.frames(0, 1))
+    train = frame.train
+    test = frame.test
     loop = new_loop(capture, config)
     start = time.process_time()
-    _, report = loop.push([view.image for view in train])
+    _, report = loop.push(train)
     seconds = time.process_time() - start
     gaussians = loop.gaussians
     assert gaussians is not None
@@ -119,7 +119,7 @@ def measure(capture: Capture, pictures: Path | None, config: StreamConfig) -> di
         "training": train,
         "held_out": test,
         "registered": [
-            view._replace(camera=camera) for view, camera in zip(test, cameras, strict=True)
+            replace(view, camera=camera) for view, camera in zip(test, cameras, strict=True)
         ],
     }
     if pictures is not None:

@@ -2,8 +2,8 @@
 
     python -m benchmarks.reports stability
 
-writes `benchmarks/results/stability.json`, and the table and the plot of the page
-docs/experiments/stability.md.
+writes `benchmarks/results/stability.json` and the plot of the page docs/experiments/stability.md;
+`python -m benchmarks.pages` writes its table.
 
 The cases are shared with the tests (`tests.scenes.extremes`, `tests.scenes.hard_fits`). Image and
 gradients are compared with a reference in extended precision, a million Gaussians with
@@ -57,7 +57,7 @@ class Options(Output):
     """Measure errors in stiff and extreme cases, against extended precision."""
 
     json: Path | None = RESULTS / "stability.json"
-    """JSON file for the rows. For the committed file, the page is written as well."""
+    """JSON file for the rows."""
     plot: Path | None = PAGES / "stability.png"
     """Plot of the errors over condition numbers, .png or .svg; needs matplotlib."""
     frames: int = 300
@@ -75,11 +75,6 @@ class Options(Output):
         if self.plot is not None:
             save_figure(condition_plot(rows), self.plot)
         self.write({"rows": rows}, unprinted=["rows"])
-        if self.json == Options.json:
-            from benchmarks.pages.__main__ import with_tables  # whose tables are made here
-
-            page = PAGES / "stability.md"
-            page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def _case_rows() -> Iterator[Row]:

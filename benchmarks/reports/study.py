@@ -23,8 +23,8 @@ from typing import Any
 import mitsuba as mi
 
 from benchmarks.speed.output import Output
-from morgs_mi.core.files import json_finite
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.platform.files import json_finite
 
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed

@@ -127,7 +127,7 @@ def moving_psnr(capture: Capture, frames: range, first: int, config: StreamConfi
     loop = new_loop(capture, config)
     scores = []
     for k, frame in enumerate(capture.partial_frames(frames.start, frames.stop)):
-        push_frame(loop, frame, capture.train_views)
+        push_frame(loop, frame)
         image = frame.images[test]
         assert loop.gaussians is not None
         assert image is not None

@@ -24,7 +24,7 @@ frames and a path of more than 10 cm.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -93,7 +93,7 @@ def track_scores(
     """Return the scores of the frames of a stream, whose capture is a synthetic clip."""
     assert capture.truth is not None
     truth = load_tracks(capture.truth)
-    cameras = [capture.cameras[view] for view in capture.train_views]
+    cameras = capture.views.train.cameras
     visible = np.any([truth.visible[camera.name] for camera in cameras], axis=0)
     frames, positions, predictions = follow(states, truth.points, visible, cameras, config)
     return score(
@@ -105,7 +105,7 @@ def follow(
     states: Iterable[FrameState],
     points: np.ndarray,
     visible: np.ndarray,
-    cameras: list[Camera],
+    cameras: Sequence[Camera],
     config: RenderConfig,
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Return the indices of T frames, the positions of points [P, T, 3] that are followed from the

@@ -1,8 +1,8 @@
 """The rule of a trial of branches: from paired fits to verdicts, and to the fit that is made next.
 
 A row is a fit of a set with a seed and without some branches (``off``), and has its scores. Rows of
-equal set and seed are pairs: their difference is what the branches do there. A *loss* counts in
-tolerances of its measure:
+equal set, code and seed are pairs: their difference is what the branches do there, and the last
+code that tried them decides. A *loss* counts in tolerances of its measure:
 
 - PSNR of held-out views, in the first frame and in later ones: 0.1 dB;
 - their PSNR where things move, and the error of the motion: their noise, which is the standard
@@ -162,19 +162,16 @@ Trials = Mapping[tuple[str, tuple[str, ...]], Trial]
 
 def trials_of(rows: Sequence[Row]) -> dict[tuple[str, tuple[str, ...]], Trial]:
     """Return the comparisons that rows allow, by set and names of the branches that are off."""
-    defaults: dict[str, dict[int, Row]] = {}
-    arms: dict[tuple[str, tuple[str, ...]], dict[int, Row]] = {}
+    fits: dict[tuple[str, str, tuple[str, ...]], dict[int, Row]] = {}
     for row in rows:
-        key = row["set"], tuple(row["off"])
-        fits = arms.setdefault(key, {}) if row["off"] else defaults.setdefault(row["set"], {})
-        fits[row["seed"]] = row
+        fits.setdefault((row["set"], row["code"], tuple(row["off"])), {})[row["seed"]] = row
     result = {}
-    for key, fits in arms.items():
-        every = defaults.get(key[0], {})
-        seeds = sorted(fits.keys() & every.keys())
-        if seeds and len(every) > 1:
-            pairs = [every[seed] for seed in seeds], [fits[seed] for seed in seeds]
-            result[key] = compared(*pairs, [*every.values()])
+    for (place, code, off), without in fits.items():
+        every = fits.get((place, code, ()), {})
+        seeds = sorted(without.keys() & every.keys())
+        if off and seeds and len(every) > 1:
+            pairs = [every[seed] for seed in seeds], [without[seed] for seed in seeds]
+            result[place, off] = compared(*pairs, [*every.values()])
     return result
 
 

@@ -23,7 +23,7 @@ import tyro
 
 from benchmarks.speed.frame_speed import SIZES, Scene, Size, default_config, loop_of
 from benchmarks.speed.output import Output
-from morgs_mi.core.bounded import read_json
+from morgs_mi.platform.bounded import read_json
 
 BASE = SIZES["small"]
 AXES: dict[str, list[Size]] = {

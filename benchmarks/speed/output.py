@@ -12,8 +12,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from morgs_mi.core.environment import machine, versions
-from morgs_mi.core.files import write_json
+from morgs_mi.platform.environment import machine, versions
+from morgs_mi.platform.files import write_json
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,9 @@ import tyro
 
 from benchmarks import workloads
 from benchmarks.speed.output import Output
-from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
+from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 
 # Timed repetitions per round; medians are reported.
@@ -73,7 +75,7 @@ def stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]
     dr.enable_grad(attributes)
 
     def step(reference: Any, region: Region | None = None) -> Any:
-        color = rasterize(gaussians, camera, ("color",), region=region).color
+        color = render_view(gaussians, ActiveView(camera, region=region)).color
         dr.backward(dr.sum(dr.abs(color - reference), axis=None) / target.size)
         grads = [dr.grad(value) for value in attributes]
         dr.eval(grads)

@@ -16,6 +16,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,19 +36,22 @@ from morgs_mi import open_stream
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.fit import later_frame
 from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.frozen_step import RecordedSteps
 from morgs_mi.loop import observation
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method import motion
+from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.playback.stream_header import open_stream_capture
-from morgs_mi.render.active_view import ActiveView, Drawing, ViewGroup
+from morgs_mi.render.active_view import Drawing, ViewGroup
 from morgs_mi.runs.fit_files import FitFiles, read_reports
 from morgs_mi.stream_loop import StreamLoop
 
 STAGES: tuple[tuple[str, Any, str], ...] = (
     ("images", observation, "copied_images"),
     ("exposures, changes", observation, "_extended"),
-    ("flow, masks", observation, "_flows"),
+    ("flow, masks", observation, "_key_views"),
     ("active set", morgs_mi.stream_loop, "find_active_set"),
+    ("active set", ActiveSet, "with_static"),
     ("lift", motion.STARTS, "lift_flow"),
     ("propagation", motion.STARTS, "propagate_motion"),
     ("search", motion.STARTS, "search_motion"),
@@ -73,16 +77,25 @@ class Options(Output):
     """Epochs of a later frame."""
 
 
+def clocks() -> dict[str, float]:
+    """Return the wall and processor seconds so far."""
+    return {"seconds": time.perf_counter(), "processor": time.process_time()}
+
+
 class Profile:
-    """Seconds, processor time and passes by stage while it is entered; `other` is outside of all
+    """What grows in each stage while it is entered, and its passes; `other` is outside of all
     stages.
+
+    Args:
+        read: returns numbers by name, which never fall.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, read: Callable[[], Mapping[str, float]] = clocks) -> None:
         self.totals: dict[str, Any] = {}
         self._open = ["other"]
         self._patches = ExitStack()
-        self._last = (0.0, 0.0)
+        self._read = read
+        self._last: Mapping[str, float] = {}
 
     def __enter__(self) -> Profile:
         for name, place, attribute in STAGES:
@@ -92,17 +105,21 @@ class Profile:
             else:
                 stage = self._timed(name, getattr(place, attribute))
                 self._patches.enter_context(patch.object(place, attribute, stage))
+        # One stage after the other.
+        self._patches.enter_context(patch.object(observation, "in_background", _at_once))
         views = {
             (ViewGroup, "draw"): lambda group: len(group.views),
             (Drawing, "_sums"): lambda drawing: len(drawing.group.views),
-            (ActiveView, "render"): lambda view: 1,
-            (dr, "backward"): lambda loss: 1,
+            (later_frame, "render_view"): lambda gaussians: 1,
+            # Recordings are counted where they are replayed.
+            (dr, "backward"): lambda loss: not dr.flag(dr.JitFlag.FreezingScope),
+            (RecordedSteps, "step"): lambda steps: 2,
         }
         for (place, attribute), count in views.items():
             function = self._counted(getattr(place, attribute), count)
             self._patches.enter_context(patch.object(place, attribute, function))
         dr.sync_thread()
-        self._last = time.perf_counter(), time.process_time()
+        self._last = self._read()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -110,12 +127,12 @@ class Profile:
         self._patches.close()
 
     def _border(self) -> None:
-        """Add the time since the last border to the innermost open stage."""
+        """Add what has grown since the last border to the innermost open stage."""
         dr.sync_thread()
-        moment = time.perf_counter(), time.process_time()
+        numbers = self._read()
         total = self.totals.setdefault(self._open[-1], Counter())
-        total.update(seconds=moment[0] - self._last[0], processor=moment[1] - self._last[1])
-        self._last = moment
+        total.update({name: value - self._last.get(name, 0) for name, value in numbers.items()})
+        self._last = numbers
 
     def _timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def stage(*args: Any, **kwargs: Any) -> Any:
@@ -155,6 +172,13 @@ class Profile:
         return rows
 
 
+def _at_once(function: Callable[[], Any]) -> Future[Any]:
+    """Return the result of a function, as `in_background` does."""
+    future: Future[Any] = Future()
+    future.set_result(function())
+    return future
+
+
 def profile_scene(size: str, epochs: int) -> dict[str, dict[str, float]]:
     """Return the profile of frame 3 of a scene of `frame_speed`."""
     scene = Scene(frame_speed.SIZES[size], 0)
@@ -175,7 +199,7 @@ def profile_fit(out: Path, frame: int, epochs: int) -> dict[str, dict[str, float
     capture = open_stream_capture(stream, None, stream.frame_numbers())
     (first,) = read_reports(FitFiles.of(out).report, range(1))
     states = {state.frame: state for state in coded_frames(iter(stream))}
-    recorded = [f.comparable(capture.train_views) for f in capture.partial_frames(0, frame + 1)]
+    recorded = [f.comparable for f in capture.partial_frames(0, frame + 1)]
     loop = StreamLoop.of(capture, StreamConfig(FitConfig(epochs=epochs)))
     profile = Profile()
     for _ in range(3):

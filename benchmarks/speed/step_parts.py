@@ -38,6 +38,7 @@ from benchmarks.speed.render_speed import timed
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render import loops
 from morgs_mi.render.active_view import ActiveView, ViewGroup
+from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 
 _ROUNDS = 8
@@ -88,10 +89,11 @@ def work(gaussians: Gaussians, camera: Camera, part: str) -> Callable[[], Any]:
     region = Region.of(mask, render) if part == "all blocks" else None
     image = np.broadcast_to(np.array(workloads.TARGET, np.float32), (*mask.shape, 3)).copy()
     target = mi.TensorXf(image if region is None else region.crop(image))
+    view = ActiveView(camera, render, region)
     dr.enable_grad(attributes)
 
     def step() -> Any:
-        color = rasterize(gaussians, camera, ("color",), region=region, config=render).color
+        color = render_view(gaussians, view).color
         dr.backward(dr.sum(dr.abs(color - target), axis=None) / image.size)
         grads = [dr.grad(value) for value in attributes]
         dr.eval(grads)
