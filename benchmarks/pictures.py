@@ -1,5 +1,5 @@
 """Draw the demo as a moving picture for the README, recordings beside their fits for the page
-docs/recordings.md, and the stages of one frame of the demo's clip for docs/how-it-works.md.
+docs/cameras.md, and the stages of one frame of the demo's clip for docs/how-it-works.md.
 
     morgs-mi demo out/demo
     morgs-mi fit out/demo/capture out/fair --exclude cam01 cam02 cam03 cam04 cam06 \

@@ -31,7 +31,7 @@ class FitInChunks(Fit):
     """Number of parts of the recording that are fitted side by side, by the extra cluster; each
     begins with a keyframe."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
-    """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/cluster.md)."""
+    """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/captures.md)."""
 
     def run(self) -> None:
         if self.chunks is not None:

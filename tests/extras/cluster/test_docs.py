@@ -1,4 +1,4 @@
-"""The commands of docs/cluster.md run."""
+"""The commands of the section on chunks in docs/captures.md run."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording
 
 ROOT = Path(__file__).parents[3]
-TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "captures.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"<!-- (run|start) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4
 
@@ -43,7 +43,7 @@ def workplace(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_cluster_page__commands_run(workplace):
+def test_chunks_section__commands_run(workplace):
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -69,6 +69,6 @@ def test_cluster_page__commands_run(workplace):
         )
 
 
-def test_cluster_page__has_commands():
+def test_chunks_section__has_commands():
     kinds = ["run", "start", "start", "run"]
     assert [kind for kind, _ in BLOCKS] == kinds

@@ -1,5 +1,5 @@
-"""The page for users of other tools: its commands run on a small recording in the folder of each of
-them.
+"""Folders of other tools, docs/captures.md: its commands run on a small recording in the folder of
+each of them.
 """
 
 import os
@@ -18,15 +18,14 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.ply import write_ply
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.playback.visualise import write_png
 from tests.quick import SHORT_FITS
 from tests.scenes import captures as layouts
-from tests.scenes.changing_splats import splats
 
-PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^    ((?:morgs-mi|ln) .*)$", PAGE, re.MULTILINE)
+PAGE = (Path(__file__).parents[2] / "docs/captures.md").read_text(encoding="utf-8")
+(BLOCK,) = re.findall(r"## Folders of other tools\n.*?```sh\n(.*?)```", PAGE, re.DOTALL)
+COMMANDS = [line for line in BLOCK.splitlines() if not line.startswith("#")]
 QUICK = "--num-gaussians 400 --first-frame-steps 20 --epochs 1 --config short.toml"
 CAMERAS = 7
 FRAMES = 2
@@ -101,13 +100,10 @@ def vggt(recording):
 
 
 @pytest.mark.slow
-def test_coming_from__commands_run_on_the_folders_of_the_tools(
-    recording, tmp_path, run, monkeypatch
-):
+def test_folders_of_other_tools__are_fitted_by_the_commands(recording, tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for write in (dynerf, multipleview, dynamic3dgs, stream3dgs, nerfstudio, vggt):
         write(recording)
-    write_ply("splat.ply", splats())
     os.mkdir("out")
     Path("short.toml").write_text(SHORT_FITS, encoding="utf-8")
     frames = {}
@@ -125,5 +121,5 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(
     assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "3dgstream")}
 
 
-def test_coming_from__names_a_command_for_each_tool():
+def test_folders_of_other_tools__have_a_command_each():
     assert len([command for command in COMMANDS if command.startswith("morgs-mi fit")]) == 6
