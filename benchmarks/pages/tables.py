@@ -216,7 +216,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
         f"trial_{name}": partial(trial_table, table)
         for name, table in (
             ("branches", needed.branches_table),
-            ("groups", needed.groups_table),
             ("sets", needed.sets_table),
         )
     },

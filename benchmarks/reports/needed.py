@@ -329,17 +329,18 @@ def summary(frames: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 
 
 def branches_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the verdict on every branch, with the set and the number that decide."""
+    """Return the verdict on every branch, with the set and the number that decide; branches of a
+    group that were tried together share a row.
+    """
     trials = trials_of(rows)
-    lines = []
+    names: dict[tuple[str, ...], list[str]] = {}
     for branch in BRANCHES:
         places = [name for name, recording in RECORDINGS.items() if acts_on(branch, recording)]
         word, place, trial = verdict(trials, branch.name, places)
-        switches = ", ".join(f"`{name.replace(':', '.')}`" for name in branch.switches)
-        word = word if switches else "gone"
-        lines.append((branch.group, branch.name, switches, word, reason(place, trial)))
-    titles = "group", "branch", "place", "verdict", "largest loss without it"
-    return markdown(titles, lines, left=5)
+        word = word if branch.switches else "gone"
+        names.setdefault((branch.group, word, reason(place, trial)), []).append(branch.name)
+    lines = [(group, "; ".join(same), *end) for (group, *end), same in names.items()]
+    return markdown(("group", "branches", "verdict", "largest loss without them"), lines, left=4)
 
 
 def reason(place: str, trial: Trial | None) -> str:
@@ -352,19 +353,6 @@ def reason(place: str, trial: Trial | None) -> str:
         change = f"{100 * loss.change:+.1f} % {loss.measure.title}"
     others = f" with {quantity(trial.count - 1, 'other')}" if trial.count > 1 else ""
     return f"{place}{others}: {change}, {quantity(trial.seeds, 'seed')}"
-
-
-def groups_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return what each set loses without several branches together."""
-    trials = trials_of(rows)
-    lines = []
-    for (place, names), trial in trials.items():
-        if len(names) > 1:
-            parts = {branch.group for branch in BRANCHES if branch.name in names}
-            title = parts.pop() if len(parts) == 1 else quantity(len(parts), "group")
-            loss = reason("", trial).partition(": ")[2]
-            lines.append((place, title, f"{len(names)}", trial.state, loss))
-    return markdown(("set", "group", "branches", "state", "largest loss"), lines, left=2)
 
 
 def sets_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -138,7 +138,7 @@ def fits_table(rows: Sequence[Row]) -> str:
     for row in rows:
         if row["kind"] == "fit":
             first, last = row["psnr"]
-            sentence = row["sentence"] or "-"
+            sentence = row["sentence"].partition(";")[0] or "-"
             lines.append((row["name"], str(row["frames"]), f"{first:.1f}", f"{last:.1f}", sentence))
     columns = ("recording", "frames", "first, dB", "last, dB", "first status")
     return markdown(columns, lines)

@@ -12,7 +12,7 @@ import pytest
 import morgs_mi
 from morgs_mi.platform.bounded import read_json
 
-PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
+PAGE = Path(__file__).parents[2] / "docs/experiments/real.md"
 FRAMES = 3
 # Appended to the fits, which then take seconds.
 SMALLER = "--num-gaussians 2500 --first-frame-steps 200 --epochs 1"
