@@ -329,18 +329,18 @@ def summary(frames: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 
 
 def branches_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the verdict on every branch, with the set and the number that decide; branches of a
-    group that were tried together share a row.
-    """
+    """Return the branches of each group by their verdicts, with the losses that keep them."""
     trials = trials_of(rows)
-    names: dict[tuple[str, ...], list[str]] = {}
+    cells: dict[tuple[str, str], list[str]] = {}
     for branch in BRANCHES:
         places = [name for name, recording in RECORDINGS.items() if acts_on(branch, recording)]
         word, place, trial = verdict(trials, branch.name, places)
-        word = word if branch.switches else "gone"
-        names.setdefault((branch.group, word, reason(place, trial)), []).append(branch.name)
-    lines = [(group, "; ".join(same), *end) for (group, *end), same in names.items()]
-    return markdown(("group", "branches", "verdict", "largest loss without them"), lines, left=4)
+        word = word.partition(" on ")[0] if branch.switches else "gone"
+        loss = "" if word in ("not needed", "gone") else reason(place, trial).partition(",")[0]
+        name = f"{branch.name} ({loss})" if loss else branch.name
+        cells.setdefault((branch.group, word), []).append(name)
+    lines = [(group, word, "; ".join(names)) for (group, word), names in cells.items()]
+    return markdown(("group", "verdict", "branches (largest loss without one)"), lines, left=3)
 
 
 def reason(place: str, trial: Trial | None) -> str:
