@@ -216,7 +216,9 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def sizes_table(sizes: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the operations of each stage, a size per column, and what the host exchanges."""
+    """Return the operations of each stage that has some, a size per column, and what the host
+    exchanges.
+    """
     stages = [*dict.fromkeys(name for name, *_ in STAGES), "other", "total"]
     lines = [
         (
@@ -227,6 +229,7 @@ def sizes_table(sizes: Mapping[str, Mapping[str, Any]]) -> str:
             ),
         )
         for name in stages
+        if any(rows.get(name, {}).get("operations") for rows in sizes.values())
     ]
     for count in ("recordings", "reads", "uploads", "stops"):
         lines.append((count, *(f"{rows['total'][count]:.0f}" for rows in sizes.values())))
