@@ -6,6 +6,7 @@ import json
 import os
 import signal
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, 
 
 # One for all tests, which then share its kernels.
 mi.set_variant(os.environ.get("MORGS_MI_TEST_VARIANT", "llvm_ad_rgb"))
+# With a single one, Mitsuba waits forever when it writes an EXR file (docs/limits.md).
+dr.set_thread_count(max(2, dr.thread_count()))
 
 
 @pytest.fixture
