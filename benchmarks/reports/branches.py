@@ -106,7 +106,7 @@ def _everywhere(mask: np.ndarray) -> tuple[slice, slice] | None:
 
 
 def _any_motion(flows: Any, d: np.ndarray) -> np.ndarray:
-    return np.any(np.linalg.norm(flows.project(d), axis=-1) > lift._NOISE_PX, axis=0)
+    return np.any(np.linalg.norm(flows.project(d), axis=-1) > lift.NOISE_PX, axis=0)
 
 
 _FREE_ROTATION = {**BY_NAME, "quats": replace(BY_NAME["quats"], gate="appearance")}
@@ -318,7 +318,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_FIRST, "half the size at first", {"fit.first_frame:half_sized": list}, True),
     Branch(_FIRST, "one band after the other", {"fit.first_frame:BAND": 0.0}, True),
     Branch(_FIRST, "SH above 0", {"fit.sh_degree": 0}, True),
-    Branch(_FIRST, "decay of all rates", {"fit.first_frame:_FINAL_RATE": 1.0}, True),
+    Branch(_FIRST, "decay of all rates", {"fit.first_frame:FINAL_RATE": 1.0}, True),
     Branch(_FIRST, "start of the density rounds", {"fit.first_frame:_FIRST_ROUND": 0.01}, True),
     Branch(_FIRST, "halving of long Gaussians", {"fit.density:_LONG": float(_ALL)}, True),
     Branch(_FIRST, "dropout", {"fit.dropout": 0.0}, True),
@@ -372,7 +372,7 @@ BRANCHES: tuple[Branch, ...] = (
             )
         },
     ),
-    Branch(_SHARES, "noise of the flow, a share", {"method.lift:_NOISE_PX": PerWidth(0.2)}),
-    Branch(_SHARES, "least motion, a share", {"method.confidence:_NOISE": PerWidth(0.2)}),
+    Branch(_SHARES, "noise of the flow, a share", {"method.lift:NOISE_PX": PerWidth(0.2)}),
+    Branch(_SHARES, "least motion, a share", {"method.confidence:NOISE_PX": PerWidth(0.2)}),
 )
 """All branches; their names are unique."""

@@ -73,11 +73,8 @@ def plan_first_frame(
         return config, None
     plan = config
     limit = config.first_frame_seconds or _SECONDS
-    # Mean numbers of pixels of a view, and of one of half the size.
-    pixels, half_pixels = (
-        float(np.mean([view.camera.width * view.camera.height for view in some]))
-        for some in (views, half_sized(views))
-    )
+    pixels = _mean_pixels(views)
+    half_pixels = _mean_pixels(half_sized(views))
 
     def seconds(plan: FitConfig) -> float:
         late_seconds = _step_seconds(plan.planned_gaussians, pixels)
@@ -106,6 +103,11 @@ def plan_first_frame(
         steps = max(_LEAST_STEPS, min(plan.planned_steps, affordable))
         plan = replace(plan, first_frame_steps=steps)
     return plan, seconds(plan)
+
+
+def _mean_pixels(views: Sequence[View]) -> float:
+    """Return the mean number of pixels of a view."""
+    return float(np.mean([view.camera.width * view.camera.height for view in views]))
 
 
 def _step_seconds(count: float, pixels: float) -> float:

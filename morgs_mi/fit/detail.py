@@ -53,10 +53,8 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     while min(values.shape[:2]) > 1:
         means = block_means(values)
         fractions = block_means(valid)
-        # At each pixel of the blocks.
-        pixel_means, is_valid = (
-            v.repeat(2, axis=0).repeat(2, axis=1) for v in (means, fractions == 1)
-        )
+        pixel_means = _pixels_of_blocks(means)
+        is_valid = _pixels_of_blocks(fractions == 1)
         height, width = is_valid.shape
         differences = np.abs(values[:height, :width] - pixel_means).max(axis=-1)
         count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & is_valid)
@@ -97,6 +95,12 @@ def block_means(values: np.ndarray) -> np.ndarray:
     """Return the means of the blocks of 2x2 pixels of an image, without the last row or column
     where their number is odd.
     """
-    height, width = (size // 2 for size in values.shape[:2])
+    height = values.shape[0] // 2
+    width = values.shape[1] // 2
     whole = values[: 2 * height, : 2 * width]
     return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _pixels_of_blocks(values: np.ndarray) -> np.ndarray:
+    """Return the values of blocks of 2x2 pixels at each of their pixels."""
+    return values.repeat(2, axis=0).repeat(2, axis=1)

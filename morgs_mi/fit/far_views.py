@@ -27,11 +27,11 @@ from morgs_mi.core.rig import (
     focus_depths,
     focus_point,
     positions_of,
-    seen_points,
     up_direction,
 )
 from morgs_mi.core.view import View
 from morgs_mi.fit.forecast import are_far_apart
+from morgs_mi.fit.view import random_pixels, seen_pixels
 from morgs_mi.platform.checks import valid_pixels
 
 Points = tuple[np.ndarray, np.ndarray]
@@ -117,9 +117,8 @@ class _Rig:
         """
         result = np.full((len(self.views), len(points), 3), np.nan, np.float32)
         for view, image, colors in zip(self.views, self.colors, result, strict=True):
-            visible, pixels, _ = seen_points(view.camera, points)
-            columns, rows = pixels.astype(int).T
-            colors[visible] = image[rows, columns]
+            visible, pixels = seen_pixels(view.camera, points)
+            colors[visible] = image[pixels]
         return result
 
     def is_near(self, points: np.ndarray, radius: float) -> np.ndarray:
@@ -156,15 +155,12 @@ def far_points(views: Sequence[View], count: int, rng: np.random.Generator) -> P
     parts = [_objects(rig, floor, round(_OBJECT_SHARE * count), rng)]
     shares = np.array_split(np.arange(count - len(parts[0][0])), len(views))
     for view, share in zip(views, shares, strict=True):
-        rows, columns = np.nonzero(valid_pixels(view.mask, view.image.shape))
-        chosen = rng.integers(0, len(rows), len(share))
-        rows = rows[chosen]
-        columns = columns[chosen]
-        pixels = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (len(share), 2))
+        valid = valid_pixels(view.mask, view.image.shape)
+        pixels, colors = random_pixels(view, valid, len(share), rng)
         points = floor.hits(view.camera, pixels)
         is_behind = ~rig.is_near(points, _FLOOR)
         points[is_behind] = _on_backdrop(rig, view.camera, pixels[is_behind])
-        parts.append((points, unit_values(view.image[rows, columns])))
+        parts.append((points, colors))
     positions, colors = zip(*parts, strict=True)
     return np.concatenate(positions), np.concatenate(colors)
 

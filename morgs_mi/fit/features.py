@@ -18,16 +18,21 @@ import numpy as np
 from morgs_mi.core.camera import Camera, unit_vectors
 from morgs_mi.core.rig import central_distances, positions_of
 
-# Larger images add no corners that other views also see, and SIFT is slow.
+# Pixels to which larger images are reduced: more show no corners that other views also see, and
+# SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
 MAX_FEATURES = 2500
-# Lowe's ratio; with more cameras than this, each is matched with its nearest neighbours only.
+"""Largest number of features of a view: descriptors of all pairs are compared."""
+# Largest ratio of the distances of the nearest and the second descriptor (Lowe 2004).
 _RATIO = 0.8
+# Number of cameras up to which all pairs are matched: their number grows with the square.
 _ALL_PAIRS = 24
+# Nearest cameras that each of more cameras is matched with.
 _NEIGHBOURS = 8
+# Least number of matches that agree with one geometry: fewer agree by chance.
 _MIN_MATCHES = 16
-# Degrees, the smallest accepted spread of the views of a point.
 MIN_ANGLE = 1.0
+"""Least spread of the views of a point, degrees: below, its depth is uncertain."""
 
 
 @dataclass(frozen=True)

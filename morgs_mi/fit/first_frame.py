@@ -4,12 +4,10 @@
 the images have half the size. `fit_confidence` follows when the second frame, and with it the flow,
 is there.
 
-Dropout of Gaussians, which improves novel views (DropGaussian, Park et al. 2025).
-
 Where training views are few or noisy, Gaussians overfit them together: one compensates for another
-in a single view. In every step of the first frame, each Gaussian is left out with probability p,
-and the opacities of the others are scaled by 1 / (1 - p). p follows from the number of views, their
-noise and the angles between them.
+in a single view. Dropout prevents it (DropGaussian, Park et al. 2025): in every step of the first
+frame, each Gaussian is left out with probability p, and the opacities of the others are scaled by
+1 / (1 - p). p follows from the number of views, their noise and the angles between them.
 """
 
 from __future__ import annotations
@@ -37,6 +35,7 @@ from morgs_mi.fit.forecast import MANY_VIEWS, are_far_apart
 from morgs_mi.fit.frozen_views import FirstSteps, is_recordable, kept, with_dropout
 from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.optimise import (
+    FINAL_RATE,
     Steps,
     adam,
     fit_problem,
@@ -57,6 +56,23 @@ from morgs_mi.render.render_config import RenderConfig
 
 # Probability with which few views are fitted that are noisy or far apart.
 _DROPOUT = 0.2
+# Passes over all views over which the losses are averaged: of fewer, a mean depends on the views
+# that come last.
+_AVERAGED_PASSES = 4
+# Least number of steps over which they are averaged, of few views.
+_LEAST_AVERAGED_STEPS = 8
+# Fraction of the steps after which another SH band is added: 1000 of 30,000 steps in 3DGS.
+BAND = 1 / 30
+# First round of density control, as a fraction of the steps: before it, errors are everywhere.
+_FIRST_ROUND = 0.1
+LAST_ROUND = 0.5
+"""Last round of density control, as a fraction of the steps: the remaining steps fit the births."""
+# Steps after which the clock is read, under a limit: reading waits until they are computed.
+_CHECKED = 20
+# Least number of steps under a limit: after fewer, there is nothing to look at.
+_LEAST_STEPS = 50
+# Time of a step with the full images relative to one with the half-sized images, as measured.
+_LATE = 2.0
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -87,25 +103,6 @@ def adapted_to_images(config: FitConfig, problem: FirstFrameProblem) -> FitConfi
     few = len(problem.views) < MANY_VIEWS
     far = are_far_apart(problem.cameras, problem.points)
     return replace(config, dropout=_DROPOUT if few and (noisy or far) else 0.0)
-
-
-# Passes over all views over which the losses are averaged, and the least number of steps.
-_AVERAGED_PASSES = 4
-_LEAST_AVERAGED_STEPS = 8
-# Fraction of the steps after which another SH band is added: 1000 of 30,000 steps in 3DGS.
-BAND = 1 / 30
-# First round of density control, as a fraction of the steps: before it, errors are everywhere.
-_FIRST_ROUND = 0.1
-LAST_ROUND = 0.5
-"""Last round of density control, as a fraction of the steps: the remaining steps fit the births."""
-# Learning rates at the end, as a fraction of those at the start.
-_FINAL_RATE = 0.1
-# Steps after which the clock is read, under a limit.
-_CHECKED = 20
-# Least number of steps under a limit.
-_LEAST_STEPS = 50
-# Time of a step with the full images relative to one with half of them.
-_LATE = 2.0
 
 
 class _Pace:
@@ -243,7 +240,7 @@ def fit_first_frame(
             start = start.select(control.step(optimizer, births).parent)
         chunk = Steps(
             pace.views(order, stop),
-            rate_factor=lambda _: _FINAL_RATE ** (pace.position / steps),
+            rate_factor=lambda _: FINAL_RATE ** (pace.position / steps),
             on_step=lambda _: progress(*pace.done()),
             averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
         )

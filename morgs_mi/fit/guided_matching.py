@@ -58,7 +58,8 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
     fundamental = _fundamental(a, b)
-    x, y = (np.column_stack([v, np.ones(len(v))]) for v in (x, y))
+    x = np.column_stack([x, np.ones(len(x))])
+    y = np.column_stack([y, np.ones(len(y))])
     of_x = x @ fundamental.T
     of_y = y @ fundamental
     slopes = np.minimum(np.hypot(*of_x[:, :2].T)[:, None], np.hypot(*of_y[:, :2].T))
@@ -82,7 +83,8 @@ def _patches_agree(
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = _carried(points, a.axes[pairs[:, 0]], first, second)
         axes = b.axes[pairs[:, 1]]
-        expected_length, length = (np.linalg.norm(vectors, axis=1) for vectors in (expected, axes))
+        expected_length = np.linalg.norm(expected, axis=1)
+        length = np.linalg.norm(axes, axis=1)
         octaves = np.log2(expected_length / length)
         cosines = (expected * axes).sum(axis=1) / expected_length / length
     return (np.abs(octaves) <= _MAX_OCTAVES) & (cosines >= np.cos(np.deg2rad(_MAX_TURN)))

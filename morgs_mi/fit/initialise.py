@@ -21,6 +21,7 @@ from morgs_mi.core.rig import focus_depths, in_image, scene_depths, scene_extent
 from morgs_mi.core.view import View
 from morgs_mi.fit.far_views import Points, are_around, far_points
 from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.view import SAME_POINT, random_pixels, seen_pixels
 from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.render.render_config import RenderConfig
 
@@ -35,8 +36,7 @@ _CHECKED = 10_000
 _CELLS = 8
 # Random depths of a random point, of which one is chosen.
 _DEPTHS = 64
-# Largest difference of the colours of one point in two views, and of two pixels of one background.
-_SAME_POINT = 0.08
+# Largest difference of the colours of two pixels of one background.
 _SAME_BACKGROUND = 2 / 255
 # Least share of the border pixels that show the background, and of the pixels if it is plain.
 _BORDER = 0.25
@@ -46,6 +46,11 @@ _PARALLEL = 10.0
 _NEIGHBOURS = 3
 # Largest deviation of the depth of a random point, as a fraction.
 _SPREAD = 0.1
+# Least scene extent, relative to the median depth: of means that move by fractions of the extent.
+_DEPTH = 1 / 6
+# Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a
+# first frame.
+_OPACITY = 0.3
 
 
 def from_points(
@@ -63,7 +68,8 @@ def from_points(
     Raises:
         ValueError: no points.
     """
-    points, colors = (v.astype(np.float64) for v in (points, colors))
+    points = points.astype(np.float64)
+    colors = colors.astype(np.float64)
     n = len(points)
     if not n:
         raise ValueError(
@@ -179,10 +185,9 @@ def _in_light(points: Points, views: Sequence[View]) -> Points:
         return points
     colors = np.full((len(hdr_views), *positions.shape), np.nan)
     for view, view_colors in zip(hdr_views, colors, strict=True):
-        visible, pixels, _ = seen_points(view.camera, positions)
-        columns, rows = pixels.astype(int).T
-        is_valid = np.ones(len(rows), bool) if view.mask is None else view.mask[rows, columns]
-        view_colors[visible] = np.where(is_valid[:, None], view.image[rows, columns], np.nan)
+        visible, pixels = seen_pixels(view.camera, positions)
+        is_valid = valid_pixels(view.mask, view.image.shape)[pixels]
+        view_colors[visible] = np.where(is_valid[:, None], view.image[pixels], np.nan)
     unseen = np.isnan(colors).all(axis=(0, 2))
     colors[:, unseen] = own_colors[unseen]
     return positions, np.nanmedian(colors, axis=0)
@@ -234,7 +239,7 @@ def seed_points(
     cameras = [view.camera for view in views]
     distances = focus_depths(cameras)
     distances[np.isinf(distances)] = _PARALLEL * scene_extent(cameras)
-    blurred = [np.asarray(cv2.blur(view.image, (3, 3))) for view in views]
+    blurred = [view.at(np.asarray(cv2.blur(view.image, (3, 3)))) for view in views]
     masks = [_shows_scene(view, background) for view in views]
     sources = [
         (view, distance, mask)
@@ -244,33 +249,22 @@ def seed_points(
     parts = [(np.zeros((0, 3)), np.zeros((0, 3)))]
     shares = np.array_split(np.arange(count), max(len(sources), 1))
     for (view, distance, mask), share in zip(sources, shares, strict=False):
-        rows, columns = np.nonzero(mask)
-        chosen = rng.integers(0, len(rows), len(share))
-        rows = rows[chosen]
-        columns = columns[chosen]
-        colors = unit_values(view.image[rows, columns])
-        within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (len(share), 2))
+        within, colors = random_pixels(view, mask, len(share), rng)
         depths = max(distance, 10 * view.camera.near) / rng.uniform(1 / 3, 3, (_DEPTHS, len(share)))
         points = view.camera.unproject(np.tile(within, (_DEPTHS, 1)), depths.ravel())
-        counts = _agreeing_views(points, np.tile(colors, (_DEPTHS, 1)), cameras, blurred)
+        counts = _agreeing_views(points, np.tile(colors, (_DEPTHS, 1)), blurred)
         best = counts.reshape(depths.shape).argmax(axis=0)
         parts.append((points.reshape(*depths.shape, 3)[best, np.arange(len(share))], colors))
     return _concatenated(parts)
 
 
-def _agreeing_views(
-    points: np.ndarray,
-    colors: np.ndarray,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-) -> np.ndarray:
+def _agreeing_views(points: np.ndarray, colors: np.ndarray, views: Sequence[View]) -> np.ndarray:
     """Return the number of views that show each of the points [P, 3] in its colour [P]."""
     counts = np.zeros(len(points), int)
-    for camera, image in zip(cameras, images, strict=True):
-        visible, pixels, _ = seen_points(camera, points)
-        columns, rows = pixels.astype(int).T
-        error = np.abs(unit_values(image[rows, columns]) - colors[visible]).max(axis=1)
-        counts[visible] += error < _SAME_POINT
+    for view in views:
+        visible, pixels = seen_pixels(view.camera, points)
+        error = np.abs(unit_values(view.image[pixels]) - colors[visible]).max(axis=1)
+        counts[visible] += error < SAME_POINT
     return counts
 
 
@@ -355,7 +349,8 @@ def fill_points(
             continue
         size = view.camera.size
         pixels = rng.uniform(0, size, (len(share), 2))
-        point_cells, cells = ((p * _CELLS / size).astype(int) for p in (point_pixels, pixels))
+        point_cells = (point_pixels * _CELLS / size).astype(int)
+        cells = (pixels * _CELLS / size).astype(int)
         is_free = np.ones((_CELLS, _CELLS), bool)
         is_free[tuple(point_cells.T)] = False
         chosen = is_free[tuple(cells.T)]
@@ -366,7 +361,8 @@ def fill_points(
         # Weighted by the inverse distance, the depths of the nearest points are averaged as 1 / z.
         k = min(_NEIGHBOURS, len(point_pixels))
         nearest = KDTree(point_pixels).query(pixels, k=k)
-        distance, near = (np.reshape(values, (-1, k)) for values in nearest)
+        distance = np.reshape(nearest[0], (-1, k))
+        near = np.reshape(nearest[1], (-1, k))
         weights = 1 / (distance + 1e-3)
         depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
         depth = depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
@@ -374,13 +370,6 @@ def fill_points(
         parts.append((view.camera.unproject(pixels, depth), colors))
     num_new = sum(len(positions) for positions, _ in parts)
     return _concatenated([resample_points(points, count - num_new, rng), *parts])
-
-
-# Least scene extent, relative to the median depth: of means that move by fractions of the extent.
-_DEPTH = 1 / 6
-# Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a
-# first frame.
-_OPACITY = 0.3
 
 
 @dataclass(frozen=True, eq=False)

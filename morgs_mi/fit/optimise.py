@@ -19,6 +19,11 @@ from morgs_mi.method.error_per_gaussian import ErrorPerGaussian
 from morgs_mi.method.objective import SQUARED_ERROR
 from morgs_mi.render.kernel_recording import render_lock
 
+FINAL_RATE = 0.1
+"""Learning rates at the end of a fit whose rates decay, as a fraction of those at its start: long
+steps find the place, short ones settle there.
+"""
+
 # PSNR of training views below which it is compared with constant images, dB. Recordings are fitted
 # better; what changes in a later frame may be a surface of one colour.
 _DOUBTFUL = 20.0

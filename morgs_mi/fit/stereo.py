@@ -17,26 +17,29 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import angles_to, scene_depths, seen_points
 from morgs_mi.core.view import View
 from morgs_mi.fit.features import reduced_size
+from morgs_mi.fit.view import SAME_POINT, seen_pixels
 from morgs_mi.platform.checks import valid_pixels
 
 # Images are reduced to this number of pixels: the points only initialise a fit, which is more
 # exact.
 _PIXELS = 2e5
-# Number of nearest cameras that each is matched with, and their least and largest angle, degrees.
+# Number of nearest cameras that each is matched with: farther ones see little else.
 _NEIGHBOURS = 2
+# Least and largest angle between two cameras, degrees: depths are uncertain, or patches unlike.
 _MIN_ANGLE = 0.5
 _MAX_ANGLE = 25.0
-# Points per pair.
+# Largest number of points of a pair: a first frame starts from some ten thousand.
 _POINTS = 4000
-# Range of searched depths, as fractions of the near and far end of the known points. With fewer
-# than this many points, the search is around the depth that the cameras look at.
+# Range of searched depths, as fractions of the near and far end of the known points.
 _NEAR = 0.6
 _FAR = 1.6
+# Least number of known points that have such ends.
 _KNOWN = 10
+# With fewer, largest ratio of a searched depth and the one that the cameras look at.
 _BLIND = 3.0
-# px, largest difference between the disparities of both directions; largest difference of a colour.
+# Largest difference between the disparities of both directions, px.
 _MAX_DIFFERENCE = 1.0
-_MAX_COLOR = 0.08
+# Side of the blocks that are compared, px.
 _BLOCK = 5
 # Least depth of a view's corners in the rectified view, for depth 1 in the camera: less is too
 # oblique.
@@ -232,10 +235,9 @@ def _some_confirmed(points: np.ndarray, others: Sequence[_Reduced]) -> np.ndarra
             # Points that have their colour in a valid pixel of another view.
             good = np.zeros(len(part), bool)
             for view in others:
-                visible, pixels, _ = seen_points(view.camera, part[:, :3])
-                columns, rows = pixels.astype(int).T
-                errors = np.abs(view.blurred[rows, columns] / 255.0 - part[visible, 3:])
-                good[visible] |= (view.valid[rows, columns] > 0) & (errors.max(axis=1) < _MAX_COLOR)
+                visible, pixels = seen_pixels(view.camera, part[:, :3])
+                errors = np.abs(view.blurred[pixels] / 255.0 - part[visible, 3:])
+                good[visible] |= (view.valid[pixels] > 0) & (errors.max(axis=1) < SAME_POINT)
             confirmed = np.concatenate([confirmed, part[good]])
     return confirmed[:_POINTS]
 

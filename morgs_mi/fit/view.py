@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import seen_points
 from morgs_mi.core.view import View
 from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.render.rasterize import rasterize
@@ -22,13 +23,15 @@ LEAST_GAIN = 0.1
 chance.
 """
 
+COARSE_WIDTH = 160
+"""Least width of views of half the size, px: in smaller ones, Gaussians are pixels."""
+SAME_POINT = 0.08
+"""Largest difference of the colours of one point in two views."""
 # Mean squared error of 100 dB.
 _LEAST_ERROR = 1e-10
-# Least width of views of half the size, px.
-COARSE_WIDTH = 160
-# Side of the withheld blocks, px.
+# Side of the withheld blocks, px: in smaller ones, the pixels around them show what is there.
 _BLOCK = 12
-# One of so many blocks is withheld.
+# One of so many blocks is withheld: enough for a score, and few for the fit.
 _SHARE = 8
 
 
@@ -52,13 +55,38 @@ def withheld_blocks(
     withheld = []
     for view in views:
         view = view.reduced(width)
-        rows, columns = (np.arange(size) // _BLOCK for size in view.image.shape[:2])
+        height, width = view.image.shape[:2]
+        rows = np.arange(height) // _BLOCK
+        columns = np.arange(width) // _BLOCK
         blocks = rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE
         is_withheld = blocks[rows][:, columns]
         valid = valid_pixels(view.mask, is_withheld.shape)
         visible.append(replace(view, mask=valid & ~is_withheld))
         withheld.append(replace(view, mask=valid & is_withheld))
     return visible, withheld
+
+
+def random_pixels(
+    view: View, mask: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return random positions [count, 2] in the pixels of a mask [H, W], and their colours
+    [count, 3], encoded.
+    """
+    rows, columns = np.nonzero(mask)
+    chosen = rng.integers(0, len(rows), count)
+    rows = rows[chosen]
+    columns = columns[chosen]
+    pixels = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (count, 2))
+    return pixels, unit_values(view.image[rows, columns])
+
+
+def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, tuple[Any, ...]]:
+    """Return which points [P, 3] lie in a view [P], and the index of their n pixels, which selects
+    the values [n, ...] of an image.
+    """
+    visible, pixels, _ = seen_points(camera, points)
+    columns, rows = pixels.astype(int).T
+    return visible, (rows, columns)
 
 
 def rendered(

@@ -23,10 +23,10 @@ import numpy as np
 
 from morgs_mi.platform.config import NonNegative, config_class
 
+NORMAL = 1.4826
+"""Standard deviations of normal noise in a median absolute deviation."""
 # Of 1; also the least threshold, and the bound of the noise of the whole image.
 _GREY_LEVEL = 1 / 255
-# Standard deviations of normal noise in a median absolute deviation.
-_NORMAL = 1.4826
 # px: 5 x 5 groups of pixels, that far apart, are a sample of the noise that thin moving parts do
 # not dominate.
 _NOISE_STEP = 4
@@ -100,7 +100,7 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
     sample = average.ravel()[:: max(1, average.size // 20_000)]
-    everywhere = min(_NORMAL * float(np.median(np.abs(sample - np.median(sample)))), _GREY_LEVEL)
+    everywhere = min(NORMAL * float(np.median(np.abs(sample - np.median(sample)))), _GREY_LEVEL)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
     threshold = np.maximum(config.sigmas * noise, _GREY_LEVEL).astype(np.float32)
     size = np.abs(average)
@@ -117,7 +117,7 @@ def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
     if not change.size:
         return np.zeros((1, 1), np.float32)
     a, b, c, d = (change[y::step, x::step] for y in (0, 1) for x in (0, 1))
-    return _NORMAL * cv2.blur(cv2.medianBlur(np.abs(a - b - c + d) / 2, 5), (3, 3))
+    return NORMAL * cv2.blur(cv2.medianBlur(np.abs(a - b - c + d) / 2, 5), (3, 3))
 
 
 def moving_region(change: np.ndarray) -> np.ndarray:

@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from morgs_mi.method.flow_sources.flow_registry import NOISE_PX
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 
 # px, the width of an image that `MaskConfig.floor` refers to.
 _FLOOR_WIDTH = 1352
-# Least threshold in px at any width: the noise of the flow itself.
-_NOISE = 0.2
 
 
 def motion_floor(width: int, config: MaskConfig) -> float:
     """Return the speed in pixels, in an image of `width` pixels, below which nothing counts as
     moving.
     """
-    return max(config.floor * width / _FLOOR_WIDTH, _NOISE)
+    return max(config.floor * width / _FLOOR_WIDTH, NOISE_PX)
 
 
 def flow_threshold(motion: np.ndarray, reliable: np.ndarray, config: MaskConfig) -> float:

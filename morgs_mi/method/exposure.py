@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from morgs_mi.method.change import NORMAL
+
 LEAST_CHANGE = 3e-3
 """Change of tones over time, of 1, below which an image is not corrected: it is an error of the
 measurement.
@@ -36,14 +38,15 @@ _STEPS = 13
 _LEAST_SCALE = 1e-3
 # Change of gain and bias in a step at which it ends, of 1: a hundredth of a grey level.
 _CONVERGED = 4e-5
+# Least number of pixels that count, of which outliers are few.
 _MIN_PIXELS = 30
 # Gains beyond 4, and inverse ones, are no exposures: the images do not show the same.
 _MAX_LOG_GAIN = np.log(4)
-# Normal standard deviations in a median absolute deviation.
-_NORMAL = 1.4826
 # Width of the thumbnails on which changes over time are measured, px: means of pixels have less
 # noise.
 _WIDTH = 96
+# Share of the pixels under one of a thumbnail that must count; 1 but for rounding.
+_ALL_VALID = 0.99
 # sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
 _TOE = 0.055
 _TONES = np.array([0.1, 0.5, 0.9])[:, None]
@@ -150,7 +153,7 @@ def _line(
         if np.abs(change - last).max() < _CONVERGED:
             break
         errors = rest - change @ rows
-        scale = 2 * max(_NORMAL * _median(np.abs(errors)), _LEAST_SCALE)
+        scale = 2 * max(NORMAL * _median(np.abs(errors)), _LEAST_SCALE)
         counts = (1 + (errors / scale) ** 2) ** -2.0  # small for outliers
     return float(prior[0] + change[0]), float(prior[1] + change[1] + _TOE * change[0])
 
@@ -172,9 +175,8 @@ def centred(exposures: Sequence[Exposure]) -> tuple[Exposure, ...]:
     shows a dark and a bright tone as their medians over the cameras. A few dark cameras would move
     a mean away from all others, and the rendering of a view between those with it.
     """
-    dark, bright = (
-        np.median([exposure(tone) for exposure in exposures], axis=0) for tone in _MIDDLE_TONES
-    )
+    dark = np.median([exposure(_MIDDLE_TONES[0]) for exposure in exposures], axis=0)
+    bright = np.median([exposure(_MIDDLE_TONES[1]) for exposure in exposures], axis=0)
     gain = (bright - dark) / (_MIDDLE_TONES[1] - _MIDDLE_TONES[0])
     reference = _exposure(gain, dark - gain * _MIDDLE_TONES[0])
     return tuple(exposure.without(reference) for exposure in exposures)
@@ -217,12 +219,13 @@ def reduced(
     """Return thumbnails of two images, of 1, and of the mask of the pixels that count, from which
     `fit_exposure` takes the change between them; arguments as for `follow_exposure`.
     """
-    small_reference, small_image = (
-        thumbnail(thumbnail(x, 4 * _WIDTH).astype(np.float32) / 255, _WIDTH)
-        for x in (reference, image)
-    )
-    small_mask = None if mask is None else thumbnail(mask.astype(np.float32), _WIDTH) > 0.99
-    return small_reference, small_image, small_mask
+    small_mask = None if mask is None else thumbnail(mask.astype(np.float32), _WIDTH) > _ALL_VALID
+    return _reduced(reference), _reduced(image), small_mask
+
+
+def _reduced(image: np.ndarray) -> np.ndarray:
+    """Return the thumbnail of an image of uint8, of 1."""
+    return thumbnail(thumbnail(image, 4 * _WIDTH).astype(np.float32) / 255, _WIDTH)
 
 
 def thumbnail(image: np.ndarray, most: int) -> np.ndarray:

@@ -117,11 +117,14 @@ def consistency_mask(
     x = x + flow[..., 0]
     y = y + flow[..., 1]
     back = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    mismatch, forth, opposite = (
-        np.einsum("hwc,hwc->hw", vectors, vectors) for vectors in (flow + back, flow, back)
-    )
-    limit = config.consistency_relative * (forth + opposite) + config.consistency_absolute
+    lengths = _squares(flow) + _squares(back)
+    limit = config.consistency_relative * lengths + config.consistency_absolute
     # An image ends half a pixel beyond the outermost centres, so the flow's own error does not
     # reject the border.
     is_within = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-    return is_within & (mismatch < limit)
+    return is_within & (_squares(flow + back) < limit)
+
+
+def _squares(vectors: np.ndarray) -> np.ndarray:
+    """Return the squared lengths [H, W] of vectors [H, W, 2]."""
+    return np.einsum("hwc,hwc->hw", vectors, vectors)

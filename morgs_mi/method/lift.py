@@ -37,6 +37,7 @@ import numpy as np
 from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.flow_sources.flow_registry import NOISE_PX
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView, ViewGroup
 
@@ -51,8 +52,6 @@ _NOISE_FRACTION = 0.2
 _ROUNDS = 4
 # Covered pixels at which a view's evidence counts half.
 _HALF_WEIGHT_PIXELS = 1.0
-# Scale s of the robust cost for a Gaussian that does not move, px: the noise of the flow.
-_NOISE_PX = 0.2
 # Evidence e_i above which a Gaussian moves.
 _MIN_EVIDENCE = 0.5
 LOGIT = 2.0
@@ -82,7 +81,7 @@ class _Flows:
         """Return r(u - J d) [V, N] (see the module), with the scale s that belongs to a motion
         [V, N, 2] in px.
         """
-        scale = _NOISE_PX + _NOISE_FRACTION * np.linalg.norm(motion, axis=-1)
+        scale = NOISE_PX + _NOISE_FRACTION * np.linalg.norm(motion, axis=-1)
         return np.log1p(np.sum((self.flow - self.project(d)) ** 2, axis=-1) / scale**2)
 
 

@@ -7,7 +7,7 @@ every Gaussian and to a rotation r, a quaternion,
 
     mu' = mu + d,    q' = r q    (Hamilton product),
 
-and the residual (eq. 12) starts from there. `fit.motion_stage` fits it. The spherical harmonics are
+and the residual (eq. 12) starts from there. `fit.later_frame` fits it. The spherical harmonics are
 not rotated.
 
 The setting `motion.model` selects a model of `MOTION_MODELS`. The package has none; models of other
@@ -57,7 +57,8 @@ MOTION_MODELS.register("none")(lambda argument, config: None)
 
 def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gaussians:
     """Return N Gaussians after a motion, as a `MotionModel` gives it."""
-    q, r = (dr.unravel(mi.Vector4f, tensor.array) for tensor in (gaussians.quats, rotation))
+    q: Jit = dr.unravel(mi.Vector4f, gaussians.quats.array)
+    r: Jit = dr.unravel(mi.Vector4f, rotation.array)
     product: Jit = dr.ravel(quaternion_product(r + mi.Vector4f(1, 0, 0, 0), q))
     quats = mi.TensorXf(product, tuple(gaussians.quats.shape))
     motion = displacement if gaussians.motion is None else gaussians.motion + displacement

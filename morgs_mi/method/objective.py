@@ -78,10 +78,9 @@ def flow_loss(
         pixel_share: weight of a pixel in a mean, 1 / the number of pixels of the whole view.
     """
     lane = dr.arange(mi.UInt32, dr.width(motion) // 2)
-    x, y = (
-        rendered - elements(target.array, 2 * lane + k)
-        for k, rendered in enumerate(read_columns(motion.array, lane, 2))
-    )
+    x, y = read_columns(motion.array, lane, 2)
+    x = x - elements(target.array, 2 * lane)
+    y = y - elements(target.array, 2 * lane + 1)
     # A hundredth of a pixel keeps the derivative finite where both agree.
     total = dr.sum(dr.sqrt(x * x + y * y + 1e-4) * reliable.array)
     return total * pixel_share

@@ -126,19 +126,16 @@ class KeyImages:
     @cached_property
     def _pixels(self) -> tuple[Float, Float | None]:
         """The targets on the group, and the weights of their numbers; None: 1."""
-        target_numbers = [
-            target.on(region)
-            for target, region in zip(self._targets, self.group.regions, strict=True)
+        pairs = zip(self._targets, self.group.regions, strict=True)
+        targets = [target.on(region) for target, region in pairs]
+        pixels = concatenated([numbers for numbers, _ in targets])
+        if all(weight is None for _, weight in targets):
+            return pixels, None
+        weights = [
+            dr.full(mi.Float, 1, dr.width(numbers)) if weight is None else weight
+            for numbers, weight in targets
         ]
-        pixels, weights = ([*column] for column in zip(*target_numbers, strict=True))
-        if all(weight is None for weight in weights):
-            return concatenated(pixels), None
-        pairs = zip(weights, pixels, strict=True)
-        full_weights = [
-            dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight
-            for weight, part in pairs
-        ]
-        return concatenated(pixels), concatenated(full_weights)
+        return pixels, concatenated(weights)
 
     @cached_property
     def _gradient(self) -> tuple[Float, Float]:

@@ -67,7 +67,8 @@ def read_flow(path: Path) -> np.ndarray:
 def _read_flo(path: Path) -> np.ndarray:
     data = path.read_bytes()
     header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
-    width, height = (int(header[name]) for name in ("width", "height"))
+    width = int(header["width"])
+    height = int(header["height"])
     length = _HEADER.itemsize + 8 * width * height
     is_flo = header["magic"] == np.float32(_MAGIC)
     if not is_flo or min(width, height) < 1 or len(data) != length:

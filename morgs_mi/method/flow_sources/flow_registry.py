@@ -18,6 +18,9 @@ import numpy as np
 from morgs_mi.method.method_registry import Registry
 from morgs_mi.platform.config import NonNegative, NonNegativeInt, config_class
 
+NOISE_PX = 0.2
+"""Noise of the flow where nothing moves, px, in images of any width."""
+
 
 @config_class
 class FlowConfig:
@@ -77,7 +80,8 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
 
     def source(pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
         box = pair.box or np.s_[:, :]
-        image, previous = (np.ascontiguousarray(v[box]) for v in (pair.image, pair.previous))
+        image = np.ascontiguousarray(pair.image[box])
+        previous = np.ascontiguousarray(pair.previous[box])
         backward, forward = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
         backward[box] = method(image, previous)
         forward[box] = method(previous, image)

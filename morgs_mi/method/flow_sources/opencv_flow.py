@@ -48,10 +48,10 @@ def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) ->
         # At least half as high as wide: DIS chooses its coarsest level by the width alone and
         # crashes where the height is less than a patch.
         missing = max(0, width // 2 - height)
-        x, y = (
-            cv2.copyMakeBorder(gray, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for gray in _gray(a, b)
-        )
-        return method.calc(x, y, _ALLOCATE)[:height]
+        a, b = _gray(a, b)
+        a = cv2.copyMakeBorder(a, 0, missing, 0, 0, cv2.BORDER_REPLICATE)
+        b = cv2.copyMakeBorder(b, 0, missing, 0, 0, cv2.BORDER_REPLICATE)
+        return method.calc(a, b, _ALLOCATE)[:height]
 
     return flow
 
@@ -105,7 +105,8 @@ def optical_flow(
     config = config_or_default("optical_flow()", config, FlowConfig())
     if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
-    a, b = (np.ascontiguousarray(byte_values(each)) for each in (image, previous))
+    a = np.ascontiguousarray(byte_values(image))
+    b = np.ascontiguousarray(byte_values(previous))
     return FLOW_METHODS[method](a, b, config)
 
 
