@@ -112,12 +112,12 @@ def draw(loop: StreamLoop, images: FrameImages) -> dict[str, np.ndarray]:
     setup = loop.setup
     state = loop.state
     observation = observe_frame(setup, state.frame, state.history, images)
-    changes = observation.changes or {}
-    view = max(observation.flows, key=lambda v: changes[v].sum())
-    camera = setup.cameras[view]
-    flow = observation.flows[view]
+    view = max(observation.key_views, key=lambda v: observation.views[v].change.sum())
+    seen = observation.views[view]
+    camera = seen.camera
+    image = seen.image
+    flow = observation.key_views[view].flow
     old_gaussians = loop.gaussians
-    image = observation.history.images[view]
     assert old_gaussians is not None
     assert state.coded is not None
     assert flow.mask is not None, "motion masks are computed at multiples of `mask_interval`"
@@ -136,7 +136,7 @@ def draw(loop: StreamLoop, images: FrameImages) -> dict[str, np.ndarray]:
     share = _changed_share(state.coded, state_after, camera)
     return {
         "image": image,
-        "changes": to_uint8(changes[view].astype(float)),
+        "changes": to_uint8(seen.change.astype(float)),
         "flow": explained_image("motion", flow_image, scale, "flow", image),
         "mask": to_uint8(flow.mask.astype(float)),
         "lifted": explained_image("motion", lifted_motion, scale, "lifted flow", picture),
@@ -152,9 +152,10 @@ def _lifted(gaussians: Gaussians, loop: StreamLoop, observation: FrameObservatio
     """Return the Gaussians after the displacement that explains the flow of the key views best
     (`lift_flow`).
     """
-    cameras = {v: loop.setup.cameras[v] for v in observation.flows}
+    flows = {v: view.flow for v, view in observation.key_views.items()}
+    cameras = {v: loop.setup.cameras[v] for v in flows}
     views = full_active_set(gaussians, cameras, loop.setup.config.render).views
-    return displaced(gaussians, lift_flow(gaussians, views, observation.flows).displacement)
+    return displaced(gaussians, lift_flow(gaussians, views, flows).displacement)
 
 
 def _channel(gaussians: Gaussians, camera: Camera, name: str) -> np.ndarray:

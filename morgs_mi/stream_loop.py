@@ -26,7 +26,6 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.view import View
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.loop.first_frame import (
-    corrected,
     fitted_first_frame,
     warn_of_order,
     with_first_confidence,
@@ -119,19 +118,20 @@ def step(
     else:
         packet, fitted = _fit_later_frame(setup, state, observation, frame_progress)
     coded = decode(state.coded, packet)
-    present = observation.history.images
-    problems = image_status([v.name for v in setup.views], state.history.images, present)
+    problems = image_status([*observation.views.values()])
     if state.coded is None:
         for problem in problems:
             _LOG.warning("frame 0: %s", problem)
-    later_exposures = observation.history.exposures
+    histories = observation.history.views
     report = replace(
         fitted,
         seconds=time.perf_counter() - start_time,
         status="; ".join(filter(None, [*problems, fitted.status])) or "ok",
-        missing_views=tuple(view.name for v, view in enumerate(setup.views) if v not in present),
+        missing_views=tuple(
+            view.name for v, view in enumerate(setup.views) if v not in observation.views
+        ),
         exposures=tuple(
-            later_exposures.get(v, Exposure()).after(first)
+            histories[v].exposure.after(first) if v in histories else first
             for v, first in enumerate(fitted.exposures)
         ),
     )
@@ -145,39 +145,32 @@ def _fit_later_frame(
     assert state.coded is not None
     config = setup.config
     motion = config.motion
-    images = observation.history.images
     # A new generator for each frame, so that it is no state.
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)
     previous = state.coded.gaussians
     if state.frame == 1:
         # The masks of frame 0 need the flow to this frame (eqs. 9-11). The confidence is coded with
         # the residual of this frame.
-        first_images = state.history.images
-        previous = with_first_confidence(setup, previous, first_images, observation.flows, rng)
+        previous = with_first_confidence(setup, previous, observation.key_views, rng)
     objective = config.fit.objective
-    active = find_active_set(
-        previous,
-        {v: setup.views[v].camera for v in images},
-        observation.changes,
-        config.render,
-        motion.active_set,
-    )
+    seen_views = observation.views
+    active = find_active_set(previous, seen_views, config.render, motion.active_set)
     # The optical flow, which is computed beside that.
-    observations = observe(observation.key_views, motion, objective)
-    channels = dict.fromkeys(
-        channel
-        for observed in ({}, *observations.values())
-        for channel in channels_of(observed, objective)
-    )
-    active = active.with_static(previous, [*channels])
-    recorded = {view: observation.encoded[view] for view in active.views}
-    scene_images = corrected(recorded, state.exposures)
-    views = {
-        v: ObservedView.of(view, Target(scene_images[v], setup.views[v].mask), observations.get(v))
-        for v, view in active.views.items()
-    }
+    key_views = observation.key_views
+    observations = observe(key_views, motion, objective)
+    observed = {}
+    for view_observations in observations.values():
+        observed |= view_observations
+    # All channels that are rendered in any view.
+    active = active.with_static(previous, channels_of(observed, objective))
+    views = {}
+    for v, view in active.views.items():
+        scene_view = seen_views[v].in_scene(state.exposures)
+        target = Target(scene_view.image, scene_view.mask)
+        flow = key_views[v].flow if v in key_views else None
+        views[v] = ObservedView.of(view, target, observations.get(v), flow)
     # The motion (eq. 5) starts from zero in the paper, and here from lifted flow and proposals.
-    start = initial_motion(previous, active, views, observation.flows, motion, rng)
+    start = initial_motion(previous, active, views, motion, rng)
     problem = FrameProblem(previous, active, views, start, setup.extent)
     # Residual (eqs. 6-8, 12) and objective (eq. 13).
     fitted = fit_later_frame(problem, config.fit, motion, rng, progress)
@@ -191,7 +184,7 @@ def _fit_later_frame(
         losses=fitted.losses,
         num_gaussians=len(fitted.gaussians),
         psnr=fitted.psnr,
-        status=fitted.problem if images else "no view has an image",
+        status=fitted.problem if seen_views else "no view has an image",
         active=active.fractions,
         steps=fitted.steps,
         exposures=state.exposures,
@@ -301,7 +294,7 @@ class StreamLoop:
             observation = observe_frame(self.setup, frame, previous, images)
         history = observation.history
         if not frame and self._can_mistake_order:
-            warn_of_order(self.setup, images, history.images)
+            warn_of_order(images, observation)
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:  # beside the fit, which starts below
@@ -323,12 +316,8 @@ class StreamLoop:
         if task is None or task[0] != self.state.frame:
             return None
         observation = task[1].result()
-        ordered = enumerate(in_order(self.setup.views, images, self.state.frame))
-        present = {v: as_array(image) for v, image in ordered if image is not None}
-        same_images = present.keys() == observation.recorded.keys() and all(
-            np.array_equal(image, observation.recorded[v]) for v, image in present.items()
-        )
-        return observation if same_images else None
+        ordered = in_order(self.setup.views, images, self.state.frame)
+        return observation if observation.is_of(ordered) else None
 
     def resume(
         self,
@@ -347,7 +336,7 @@ class StreamLoop:
         """
         history = ImageHistory()
         for images in frames:
-            if not history.images:
+            if not history.views:
                 self.setup = over_border(self.setup, images)
             history = extended_history(self.setup, coded.frame, history, images)
         self.state = StreamState(coded.frame + 1, coded, history, tuple(exposures))

@@ -379,8 +379,8 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
     coded = full[0].state.coded
     loop.resume(coded, [[*images]])
     images[:] = 0
-    history = loop.state.history.images
-    assert_array_equal([history[view] for view in range(4)], clip[0][:4])
+    history = loop.state.history.views
+    assert_array_equal([history[view].image for view in range(4)], clip[0][:4])
     with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
         loop.resume(coded, [[*images[:, :50]]])
 

@@ -48,7 +48,7 @@ from morgs_mi.stream_loop import StreamLoop
 
 STAGES: tuple[tuple[str, Any, str], ...] = (
     ("images", observation, "copied_images"),
-    ("exposures, changes", observation, "_extended"),
+    ("exposures, changes", observation, "_seen_views"),
     ("flow, masks", observation, "_key_views"),
     ("active set", morgs_mi.stream_loop, "find_active_set"),
     ("active set", ActiveSet, "with_static"),

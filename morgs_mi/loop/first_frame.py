@@ -31,7 +31,7 @@ from morgs_mi.fit.initialise import (
     unseen_points,
 )
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.input_images import FrameImages, Images
+from morgs_mi.loop.input_images import FrameImages
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
@@ -39,12 +39,11 @@ from morgs_mi.loop.observation import (
     observe_frame,
     over_border,
     prepare,
-    views_of,
 )
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
-from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.objective import KeyView
 from morgs_mi.platform.checks import check_type, numbers, require
 from morgs_mi.platform.config import config_or_default
 from morgs_mi.platform.extras import extra, places
@@ -137,23 +136,22 @@ def fit_gaussians(
     views = [View(camera, mask=mask) for camera, mask in pairs]
     setup = over_border(prepare(views, points, point_colors, config), images)
     observed = observe_frame(setup, 0, ImageHistory(), images)
-    warn_of_order(setup, images, observed.history.images)
+    warn_of_order(images, observed)
     packet, report = fitted_first_frame(setup, observed, Progress(progress, "Frame 0"), None)
     seconds = time.perf_counter() - begin
     report = replace(report, seconds=seconds, status=report.status or "ok")
     return FittedImages(decode(None, packet).gaussians, setup.config.render, report)
 
 
-def warn_of_order(setup: Setup, images: FrameImages, present: Images) -> None:
+def warn_of_order(images: FrameImages, observed: FrameObservation) -> None:
     """Warn if images seem to be in another order than the cameras; in a dict they have names.
 
     Args:
-        setup: data that all frames share.
         images: of the first frame, as they were given.
-        present: those that exist as a display shows them, by view index.
+        observed: the views that have one.
     """
     if not isinstance(images, Mapping | Views) and "problems" in places("cameras"):
-        for problem in extra("cameras", "problems")(views_of(setup, present)):
+        for problem in extra("cameras", "problems")([*observed.views.values()]):
             _LOG.warning("frame 0: %s", problem)
 
 
@@ -167,7 +165,7 @@ def fitted_first_frame(
 
     Args:
         setup: data that all frames share.
-        observed: the images.
+        observed: the views with their images.
         progress: of the stages.
         on_provisional: called with provisional keyframes during the fit; None: there are none.
     """
@@ -175,11 +173,11 @@ def fitted_first_frame(
     config = setup.config
     problems = [unseen_points(setup.cameras, setup.points)]
     if not has_points(setup.cameras, setup.points):
-        points, colors = _found_points(setup, observed.history.images, progress)
+        points, colors = _found_points(setup, observed, progress)
         setup = replace(setup, points=points, point_colors=colors)
     on_round = _on_round(setup, on_provisional)
-    exposures, exposure_entry = _balanced(setup, observed.encoded, progress, on_round)
-    views = views_of(setup, corrected(observed.encoded, exposures))
+    exposures, exposure_entry = _balanced(setup, observed, progress, on_round)
+    views = [view.in_scene(exposures) for view in observed.views.values()]
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan, seconds = plan_first_frame(views, setup.points, config.fit)
     cloud = setup.points, setup.point_colors
@@ -234,13 +232,13 @@ def fitted_first_frame(
     return packet, report
 
 
-def _found_points(setup: Setup, images: Images, progress: Progress) -> Points:
-    """Return the points that are found in images of uint8, none if these are too few to cover the
+def _found_points(setup: Setup, observed: FrameObservation, progress: Progress) -> Points:
+    """Return the points that are found in the images, none if these are too few to cover the
     views.
     """
     progress.of("Matching views")(0, 1)
     rng = rng_of(setup.config.seed, Stream.POINTS)
-    points, colors = image_points(views_of(setup, images), rng)
+    points, colors = image_points([*observed.views.values()], rng)
     count = len(points) if len(points) >= MANY_POINTS else 0
     return points[:count], colors[:count]
 
@@ -256,7 +254,7 @@ def preview(
     config = replace(setup.config, fit=replace(fit, exposure="on", short_fits=short_fits))
     setup = replace(setup, config=config)
     observed = observe_frame(setup, 0, ImageHistory(), images)
-    _balanced(setup, observed.encoded, progress.part(0, 1), _on_round(setup, on_provisional))
+    _balanced(setup, observed, progress.part(0, 1), _on_round(setup, on_provisional))
 
 
 def _on_round(
@@ -271,47 +269,41 @@ def _on_round(
 
 def _balanced(
     setup: Setup,
-    images: Images,
+    observed: FrameObservation,
     progress: Progress,
     on_round: Callable[[Gaussians], None] | None,
 ) -> tuple[tuple[Exposure, ...], dict[str, Any]]:
     """Return the exposures of all views by the balance of the cameras, empty if they are not
-    estimated, and the entry of the first frame's report, from the images of the first frame.
+    estimated, and the entry of the first frame's report.
     """
     config = setup.config
     if config.fit.exposure == "off":
         return (), {}
-    exposures: dict[int, Exposure] = {}
+    exposures = [Exposure() for _ in setup.views]
     entry: dict[str, Any] = {}
-    if len(images) > 1:
+    if len(observed.views) > 1:
         rng = rng_of(config.seed, Stream.BALANCED_POINTS)
         fit = short_fit_config(config.fit)
         cloud = setup.points, setup.point_colors
-        problem = FirstFrameProblem.of(views_of(setup, images), cloud, fit, config.render, rng)
+        views = [view.in_scene() for view in observed.views.values()]
+        problem = FirstFrameProblem.of(views, cloud, fit, config.render, rng)
         balance = balance_cameras(problem, config.fit, config.seed, progress, on_round)
         if balance.taken:
-            exposures = dict(zip(images, balance.exposures, strict=True))
+            for v, exposure in zip(observed.views, balance.exposures, strict=True):
+                exposures[v] = exposure
         entry["exposure"] = {
             "sentence": balance.sentence,
             "taken": balance.taken,
             "recorded_psnr": balance.recorded_psnr,
             "balanced_psnr": balance.balanced_psnr,
         }
-    return tuple(exposures.get(v, Exposure()) for v in range(len(setup.views))), entry
-
-
-def corrected(images: Images, exposures: Sequence[Exposure]) -> dict[int, np.ndarray]:
-    """Return images, by view index, in the colours of the scene, by the exposures of all views in
-    the first frame; none: as they are.
-    """
-    return {v: exposures[v].corrected(image) if exposures else image for v, image in images.items()}
+    return tuple(exposures), entry
 
 
 def with_first_confidence(
     setup: Setup,
     gaussians: Gaussians,
-    images: Images,
-    flows: Mapping[int, FlowObservation],
+    key_views: Mapping[int, KeyView],
     rng: np.random.Generator,
 ) -> Gaussians:
     """Return the Gaussians of the first frame with a confidence learned from the masks of that
@@ -320,19 +312,22 @@ def with_first_confidence(
     Args:
         setup: data that all frames share.
         gaussians: the Gaussians.
-        images: of the first frame, by view index.
-        flows: optical flow of key views to the second frame, by view index.
+        key_views: in the second frame, with the optical flow between the two, by view index.
         rng: of the order of the views.
     """
     config = setup.config
     motion = config.motion
-    if not (flows and motion.learn_confidence and config.fit.confidence_steps):
+    if not (key_views and motion.learn_confidence and config.fit.confidence_steps):
         return gaussians
     masks = {
         v: motion_mask(
-            images[v], flow.forward_flow, flow.forward_reliable, motion.mask_method, motion.masks
+            view.pair.previous,
+            view.flow.forward_flow,
+            view.flow.forward_reliable,
+            motion.mask_method,
+            motion.masks,
         )
-        for v, flow in flows.items()
+        for v, view in key_views.items()
     }
     return fit_confidence(
         gaussians, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng

@@ -14,6 +14,7 @@ import numpy as np
 
 from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.view import View, Views
+from morgs_mi.loop.seen_view import SeenView
 from morgs_mi.method.exposure import thumbnail
 from morgs_mi.platform.checks import kind_of
 from morgs_mi.platform.threads import map_in_threads
@@ -27,8 +28,6 @@ FrameImages: TypeAlias = (
 )
 """One image or None for each view in the cameras' order, the images by the cameras' names, or
 views with their images, such as ``frame.train`` of a capture's frames."""
-Images = Mapping[int, np.ndarray]
-"""Images of those views that have one, by view index."""
 # px: thumbnails of this width keep the layout of a scene, without noise and the motion between two
 # frames.
 _WIDTH = 16
@@ -139,53 +138,62 @@ def in_order(views: Sequence[View], images: Any, frame: int) -> list[InputImage 
     return list(images)
 
 
-def image_status(names: Sequence[str], previous: Images, images: Images) -> tuple[str, ...]:
+def image_status(views: Sequence[SeenView]) -> tuple[str, ...]:
     """Return a sentence with advice for each problem of a frame's images.
 
     Args:
-        names: of the views.
-        previous: images of the frame before, uint8 [H, W, 3], by view index; empty for the first
-            frame.
-        images: of this frame, likewise.
+        views: the views that have one.
     """
-    small = map_in_threads(
-        lambda image: thumbnail(image, _WIDTH).astype(np.float64),
-        [*previous.values(), *images.values()],
-    )
-    old_thumbnails = dict(zip(previous, small, strict=False))
-    thumbnails = dict(zip(images, small[len(previous) :], strict=True))
-    plain = [v for v, image in thumbnails.items() if image.std((0, 1)).max() < _PLAIN]
-    views = (v for v in thumbnails.keys() & previous.keys() if v not in plain)
-    cuts = [v for v in views if _is_cut(old_thumbnails[v], thumbnails[v])]
+    plain = []
+    cuts = []
+    brightest = 0.0
+    thumbnails = map_in_threads(_thumbnails, views)
+    for view, (image, *previous) in zip(views, thumbnails, strict=True):
+        if _is_plain(image):
+            plain.append(view)
+            brightest = max(brightest, image.mean())
+        elif previous and _is_cut(previous[0], image):
+            cuts.append(view)
     sentences = []
     if plain:
-        color = "black" if max(thumbnails[v].mean() for v in plain) < _BLACK else "of one colour"
+        color = "black" if brightest < _BLACK else "of one colour"
         sentences.append(
-            f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or "
-            "leave the camera out (--exclude)"
+            f"{_list(plain)}: the image is {color}; cut such frames off the recording, or leave "
+            "the camera out (--exclude)"
         )
-    if cuts and 2 * len(cuts) >= len(thumbnails):
+    if cuts and 2 * len(cuts) >= len(views):
         sentences.append(
             "the images show another scene than in the frame before; end the fit before this "
             "frame (--frames), and fit the rest as another recording"
         )
     elif cuts:
         sentences.append(
-            f"{_list(names, cuts)}: the image shows something else than in the frame before; if "
-            "the camera was moved, or its clip has a cut, leave it out (--exclude)"
+            f"{_list(cuts)}: the image shows something else than in the frame before; if the "
+            "camera was moved, or its clip has a cut, leave it out (--exclude)"
         )
     return tuple(sentences)
 
 
-def _list(names: Sequence[str], views: Sequence[int]) -> str:
-    return ", ".join(names[v] or f"view {v}" for v in sorted(views))
+def _list(views: Sequence[SeenView]) -> str:
+    return ", ".join(view.name or f"view {view.index}" for view in views)
+
+
+def _thumbnails(view: SeenView) -> list[np.ndarray]:
+    """Return thumbnails of a view's image, and of the one of the frame before if there is one."""
+    images = [view.image] if view.previous is None else [view.image, view.previous]
+    return [thumbnail(image, _WIDTH).astype(np.float64) for image in images]
+
+
+def _is_plain(image: np.ndarray) -> bool:
+    """Return whether a thumbnail is of one colour."""
+    return bool(image.std((0, 1)).max() < _PLAIN)
 
 
 def _is_cut(a: np.ndarray, b: np.ndarray) -> bool:
     """Return whether two thumbnails show different scenes; another exposure, or light after black,
     is no cut.
     """
-    if a.std((0, 1)).max() < _PLAIN:
+    if _is_plain(a):
         return False
     a = a - a.mean((0, 1))
     b = b - b.mean((0, 1))

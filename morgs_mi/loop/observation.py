@@ -16,13 +16,14 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import OF_SENSOR, Camera
-from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
+from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.view import View, Views
 from morgs_mi.fit.budget import check_capacity
 from morgs_mi.fit.far_views import are_around
 from morgs_mi.fit.initialise import border_color, has_points, mean_color
-from morgs_mi.loop.input_images import FrameImages, Images, copied_images
+from morgs_mi.loop.input_images import FrameImages, InputImage, as_array, copied_images
+from morgs_mi.loop.seen_view import SeenView, ViewHistory
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region
 from morgs_mi.method.exposure import (
@@ -32,7 +33,7 @@ from morgs_mi.method.exposure import (
     fit_exposure,
     reduced,
 )
-from morgs_mi.method.flow import FlowObservation, observe_key_views
+from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_model import MOTION_MODELS
@@ -46,17 +47,10 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ImageHistory:
-    """Images up to a frame, with the exposure of each view's first image if exposures are
-    estimated.
-    """
+    """Images up to a frame."""
 
-    #: Of that frame as a display shows them, uint8, by view index, of the views that have one.
-    images: Images = field(default_factory=dict)
-    #: Images that the next frame is compared with to detect changes, by view index.
-    references: Images = field(default_factory=dict)
-    #: Of that frame relative to the view's first image, by view index; empty if they are not
-    #: estimated.
-    exposures: Mapping[int, Exposure] = field(default_factory=dict)
+    #: Of the views that had one so far, by view index.
+    views: Mapping[int, ViewHistory] = field(default_factory=dict)
     #: Stops by which linear light is brightened for them; None before the first frame.
     display_exposure: float | None = None
     kind: str = ""  #: Numbers of the images, uint8 or float32; empty before the first.
@@ -66,13 +60,8 @@ class ImageHistory:
 class FrameObservation:
     """Observations of a frame that follow from its images alone."""
 
-    history: ImageHistory  #: The images, with those before.
-    #: Masks of changed pixels [H, W], by view index; None: all pixels may have changed.
-    changes: Mapping[int, np.ndarray] | None
-    #: Images that the fit compares, encoded, by view index: `history.images` where uint8 was given,
-    #: otherwise float32 with values above 1.
-    encoded: Images
-    recorded: Images  #: The images as they were given, by view index.
+    views: Mapping[int, SeenView]  #: The views that have an image, by view index.
+    history: ImageHistory  #: Their images, with those before.
     pending_key_views: Future[dict[int, KeyView]]  #: See `key_views`.
 
     @property
@@ -85,10 +74,14 @@ class FrameObservation:
         """
         return self.pending_key_views.result()
 
-    @property
-    def flows(self) -> dict[int, FlowObservation]:
-        """Optical flow of these views, likewise."""
-        return {v: view.flow for v, view in self.key_views.items()}
+    def is_of(self, images: Sequence[InputImage | None]) -> bool:
+        """Return whether the observation is of these images, one or None for each training view."""
+        return all(
+            np.array_equal(as_array(image), self.views[v].recorded)
+            if v in self.views
+            else image is None
+            for v, image in enumerate(images)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +161,8 @@ def over_border(setup: Setup, images: FrameImages) -> Setup:
     backgrounds = [render.background, *(camera.background for camera in setup.cameras)]
     if any(b is not None for b in backgrounds) or has_points(setup.cameras, setup.points):
         return setup
-    encoded = observe_frame(setup, 0, ImageHistory(), images).encoded
-    views = views_of(setup, encoded)
+    observation = observe_frame(setup, 0, ImageHistory(), images)
+    views = [view.in_scene() for view in observation.views.values()]
     color = border_color(views)
     source = "colour of the images' borders"
     if color is None and are_around(setup.cameras):
@@ -184,11 +177,6 @@ def over_border(setup: Setup, images: FrameImages) -> Setup:
     )
     render = replace(render, background=color)
     return replace(setup, config=replace(setup.config, render=render))
-
-
-def views_of(setup: Setup, images: Images) -> list[View]:
-    """Return the views that have an image."""
-    return [setup.views[v].at(image) for v, image in images.items()]
 
 
 def observe_frame(
@@ -206,87 +194,92 @@ def observe_frame(
     Raises:
         ValueError: as for `copied_images`.
     """
-    recorded = copied_images(setup.views, images, frame, history.kind)
-    new_history, changes = _extended(setup, history, recorded)
+    views, new_history = _seen_views(setup, frame, history, images)
     # Beside the search for the active Gaussians, which does not need it.
-    key_views = in_background(
-        partial(_key_views, setup, frame, history.images, new_history.images, changes)
-    )
-    encoded = {
-        v: new_history.images[v]
-        if image.dtype == np.uint8
-        else new_history.exposures.get(v, Exposure()).corrected(encode_light(image))
-        for v, image in recorded.items()
-    }
-    return FrameObservation(new_history, changes, encoded, recorded, key_views)
+    key_views = in_background(partial(_key_views, setup, frame, views))
+    return FrameObservation(views, new_history, key_views)
 
 
 def extended_history(
     setup: Setup, frame: int, history: ImageHistory, images: FrameImages
 ) -> ImageHistory:
     """Return the images up to a frame, without flow; arguments and errors of `observe_frame`."""
-    return _extended(setup, history, copied_images(setup.views, images, frame, history.kind))[0]
+    return _seen_views(setup, frame, history, images)[1]
 
 
-def _extended(
-    setup: Setup, history: ImageHistory, recorded: Images
-) -> tuple[ImageHistory, dict[int, np.ndarray] | None]:
-    """Return the images up to a frame with these, and the masks of its changes; None: all may have
-    changed.
+def _seen_views(
+    setup: Setup, frame: int, history: ImageHistory, images: FrameImages
+) -> tuple[dict[int, SeenView], ImageHistory]:
+    """Return the views that have an image, compared with those before, and the images up to the
+    frame; arguments and errors of `observe_frame`.
     """
-    skip = setup.config.fit.skip_static
-    follow = setup.config.fit.exposure != "off"
+    fit = setup.config.fit
+    recorded = copied_images(setup.views, images, frame, history.kind)
     stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
     stops = display_stops(recorded.values()) if stops is None else stops
     display_images = {v: display_image(image, stops) for v, image in recorded.items()}
-    kind = next((image.dtype.name for image in recorded.values()), history.kind)
-    if not (skip or follow):
-        return ImageHistory(display_images, display_exposure=stops, kind=kind), None
-    views = sorted(display_images.keys() & history.references.keys())
     exposures = {}
-    if follow:
-        # Relative to the views' first images, without the change of light that all views show.
-        pairs = map_in_threads(
-            lambda v: (
-                *reduced(history.references[v], display_images[v], setup.views[v].mask),
-                history.exposures.get(v),
-            ),
-            views,
+    if fit.exposure != "off":
+        exposures = _exposures(setup, history, display_images)
+
+    def seen_view(v: int) -> SeenView:
+        """Return a view with its image, compared with those before."""
+        view = setup.views[v]
+        before = history.views.get(v)
+        exposure = exposures.get(v, Exposure())
+        image = exposure.corrected(display_images[v])
+        reference = image
+        # A view's first image has no changes; without `skip_static`, all pixels count as changed.
+        change = np.full(image.shape[:2], not fit.skip_static)
+        if before is not None and (fit.skip_static or exposures):
+            mask = change_mask(before.reference, image, view.mask, setup.config.motion.change)
+            # The reference is replaced where the image changed: a slow change is detected once it
+            # has added up.
+            old = before.reference.copy()
+            reference = np.asarray(cv2.copyTo(image, mask.astype(np.uint8), old))
+            change |= mask
+        return SeenView(
+            view.camera,
+            image,
+            view.mask,
+            change=change,
+            index=v,
+            recorded=recorded[v],
+            previous=None if before is None else before.image,
+            history=ViewHistory(image, reference, exposure),
         )
-        # A fit is many short operations, for which threads would only wait for each other.
-        view_exposures = [fit_exposure(*pair) for pair in pairs]
-        light = common_change(view_exposures)
-        relative = [exposure.without(light) for exposure in view_exposures]
-        # The identity where an exposure hardly changes an image.
-        visible = [e if e.change > LEAST_CHANGE else Exposure() for e in relative]
-        exposures = {**history.exposures, **dict(zip(views, visible, strict=True))}
-    images = {
-        v: exposures[v].corrected(image) if v in exposures else image
-        for v, image in display_images.items()
-    }
-    # A view's first image has no changes.
-    changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}
-    references = {**history.references, **images}
-    config = setup.config.motion.change
-    masks = map_in_threads(
-        lambda v: change_mask(history.references[v], images[v], setup.views[v].mask, config), views
+
+    views = dict(zip(recorded, map_in_threads(seen_view, recorded), strict=True))
+    histories = {v: replace(view, image=None) for v, view in history.views.items()}
+    histories |= {v: view.history for v, view in views.items()}
+    kind = next((image.dtype.name for image in recorded.values()), history.kind)
+    return views, ImageHistory(histories, stops, kind)
+
+
+def _exposures(
+    setup: Setup, history: ImageHistory, images: Mapping[int, np.ndarray]
+) -> dict[int, Exposure]:
+    """Return the exposures of images relative to the first ones of their views, where these are
+    not the first, without the change of light that all views show.
+    """
+    views = [v for v in images if v in history.views]
+    pairs = map_in_threads(
+        lambda v: (
+            *reduced(history.views[v].reference, images[v], setup.views[v].mask),
+            history.views[v].exposure,
+        ),
+        views,
     )
-    for v, mask in zip(views, masks, strict=True):
-        changes[v] = mask
-        # The reference is replaced where the image changed: a slow change is detected once it has
-        # added up.
-        old = history.references[v].copy()
-        references[v] = np.asarray(cv2.copyTo(images[v], mask.astype(np.uint8), old))
-    return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
+    # A fit is many short operations, for which threads would only wait for each other.
+    exposures = [fit_exposure(*pair) for pair in pairs]
+    light = common_change(exposures)
+    relative = [exposure.without(light) for exposure in exposures]
+    # The identity where an exposure hardly changes an image.
+    visible = [e if e.change > LEAST_CHANGE else Exposure() for e in relative]
+    return dict(zip(views, visible, strict=True))
 
 
-def _key_views(
-    setup: Setup,
-    frame: int,
-    previous: Images,
-    images: Images,
-    changes: Mapping[int, np.ndarray] | None,
-) -> dict[int, KeyView]:
+def _key_views(setup: Setup, frame: int, views: Mapping[int, SeenView]) -> dict[int, KeyView]:
     """Return the key views that changed with their optical flow, and with masks in every n-th
     frame, where a term uses it.
     """
@@ -295,18 +288,19 @@ def _key_views(
     with_masks = has_mask_loss and frame % motion.mask_interval == 0
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
         return {}
-    common_views = sorted(previous.keys() & images.keys())
+    common_views = [v for v, view in views.items() if view.previous is not None]
     key_views = [v for v in setup.key_views if v in common_views]
     if len(key_views) < len(setup.key_views) and common_views:  # others, where some lack an image
         chosen = choose_key_views([setup.cameras[v] for v in common_views], len(setup.key_views))
         key_views = [common_views[k] for k in chosen]
     pairs = {}
     for v in key_views:
-        box = None if changes is None else box_around(changes[v])
-        if changes is None or box is not None:
-            region = None if changes is None else moving_region(changes[v])
-            view = setup.views[v]
-            pairs[v] = FramePair(images[v], previous[v], view.name, frame, view.mask, box, region)
+        view = views[v]
+        box = box_around(view.change)
+        if box is not None and view.previous is not None:
+            region = moving_region(view.change)
+            pair = FramePair(view.image, view.previous, view.name, frame, view.mask, box, region)
+            pairs[v] = pair
     if not pairs:
         return {}
     masks = motion.mask_method if with_masks else None

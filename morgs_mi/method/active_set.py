@@ -39,7 +39,7 @@ overlap is the mean over these views,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import prod
 
@@ -52,100 +52,13 @@ from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.rig import choose_key_views
+from morgs_mi.core.view import View
 from morgs_mi.method.boxes import Boxes, boxes_around
 from morgs_mi.platform.config import Count, NonNegative, config_class
 from morgs_mi.render.active_view import ActiveView, ViewGroup
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.region import BlockGrid, Region, stacked
 from morgs_mi.render.render_config import RenderConfig
-
-
-@dataclass(frozen=True, eq=False)
-class ChangedViews:
-    """V views, their changed pixels and the Gaussians in them."""
-
-    cameras: Sequence[Camera]  #: The views.
-    changes: Sequence[np.ndarray]  #: Masks of the changed pixels, bool [H, W].
-    render: RenderConfig  #: Cut-offs.
-    boxes: Boxes  #: Boxes of the N Gaussians.
-
-    @classmethod
-    def of(
-        cls,
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        changes: Sequence[np.ndarray],
-        render: RenderConfig,
-    ) -> ChangedViews:
-        """Return the views with the boxes of N >= 1 Gaussians."""
-        return cls(cameras, changes, render, boxes_around(gaussians, cameras, render, _CORE))
-
-    @cached_property
-    def counts(self) -> np.ndarray:
-        """Number of changed pixels of each block, int32 [V, rows, columns], see `stacked`."""
-        return stacked([*map(BlockGrid.counts, self.boxes.grids, self.changes)])
-
-
-def responsibility(
-    gaussians: Gaussians, changed_views: ChangedViews, min_weight: float, width: int = 640
-) -> np.ndarray:
-    """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden
-    ones.
-
-    Args:
-        gaussians: N Gaussians of the previous frame, detached.
-        changed_views: V views with the boxes of these Gaussians.
-        min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian
-            counts as hidden.
-        width: views are reduced by the largest whole factor that leaves this width, in px.
-    """
-    views = []
-    shares = []
-    areas = []  # of a reduced pixel, by block
-    masks = []
-    factors = []
-    render = changed_views.render
-    for camera, change in zip(changed_views.cameras, changed_views.changes, strict=True):
-        factor = max(camera.width // width, 1)
-        h, w = (max(size // factor, 1) for size in change.shape)
-        share = cv2.resize(255 * change.astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA)
-        mask = BlockGrid(w, h, block_shape(render)).counts(share > 0) > 0
-        if change.any():
-            region = Region(BlockGrid(w, h, block_shape(render)), mask)
-            views.append(ActiveView(camera.resized(w, h), render, region))
-            shares.append(share / np.float32(255))
-            areas.append(np.full(region.num_blocks, factor**2))
-        masks.append(mask)
-        factors.append(factor)
-    if not views:
-        return np.zeros(len(gaussians), np.float32)
-    # Blend weights summed over changed pixels, and over all in their blocks, in px of the view.
-    group = ViewGroup(views)
-    pixel_area = np.concatenate(areas)[:, None, None]
-    share = group.crop(shares)
-    maps = np.stack([pixel_area * share, np.broadcast_to(pixel_area, share.shape)], axis=-1)
-    change_weight, weight = group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
-    visible = weight > min_weight
-    # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
-    # view.
-    boxes = changed_views.boxes
-    area = boxes.total(boxes.area)
-    sides = np.outer(factors, block_shape(render))
-    near = boxes.total(boxes.within(stacked(masks), sides))
-    area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
-    return visible * change_weight / np.maximum(weight * area_ratio, 1e-30)
-
-
-def overlap(changed_views: ChangedViews) -> np.ndarray:
-    """Return the overlap o [N] of each Gaussian with the changes, from 0 to 1; 0 for one that is in
-    no view.
-    """
-    boxes = changed_views.boxes
-    near = boxes.within(changed_views.counts > 0, boxes.sides)
-    shares = boxes.total(near / dr.maximum(boxes.area, 1))
-    counts = boxes.total(dr.select(boxes.area > 0, mi.Float(1), 0))
-    return np.asarray(shares / dr.maximum(counts, 1))
-
 
 # Fraction of a connected change that active Gaussians must cover to explain it.
 EXPLAINED = 0.5
@@ -162,6 +75,109 @@ _CORE = 0.6
 _MIN_OVERLAP = 0.35
 # Responsibility below which an active Gaussian is rendered in `quiet_views` only.
 QUIET = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedView(View):
+    """A view with the pixels that have changed since the frame before."""
+
+    change: np.ndarray = field(kw_only=True)  #: Mask of these pixels, bool [H, W].
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedViews:
+    """V views, their changed pixels and the Gaussians in them."""
+
+    views: Sequence[ChangedView]  #: The views.
+    render: RenderConfig  #: Cut-offs.
+    boxes: Boxes  #: Boxes of the N Gaussians.
+
+    @classmethod
+    def of(
+        cls, gaussians: Gaussians, views: Sequence[ChangedView], render: RenderConfig
+    ) -> ChangedViews:
+        """Return the views with the boxes of N >= 1 Gaussians."""
+        cameras = [view.camera for view in views]
+        return cls(views, render, boxes_around(gaussians, cameras, render, _CORE))
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Number of changed pixels of each block, int32 [V, rows, columns], see `stacked`."""
+        pairs = zip(self.boxes.grids, self.views, strict=True)
+        return stacked([grid.counts(view.change) for grid, view in pairs])
+
+
+@dataclass(frozen=True, eq=False)
+class _ReducedView:
+    """A changed view at a fraction of its resolution."""
+
+    camera: Camera  # of the reduced size
+    share: np.ndarray  # changed share of each pixel [h, w]
+    blocks: np.ndarray  # those with changes, bool [rows, columns]
+    factor: int  # by which the view is reduced
+
+    @classmethod
+    def of(cls, view: ChangedView, width: int, render: RenderConfig) -> _ReducedView:
+        """Return a view, reduced by the largest whole factor that leaves a width in px."""
+        factor = max(view.camera.width // width, 1)
+        size = (max(view.camera.width // factor, 1), max(view.camera.height // factor, 1))
+        change = 255 * view.change.astype(np.uint8)
+        share = cv2.resize(change, size, interpolation=cv2.INTER_AREA)
+        blocks = BlockGrid(*size, block_shape(render)).counts(share > 0) > 0
+        return cls(view.camera.resized(*size), share / np.float32(255), blocks, factor)
+
+    def drawn(self, render: RenderConfig) -> ActiveView:
+        """Return the view of the blocks with changes."""
+        grid = BlockGrid(*self.camera.size, block_shape(render))
+        return ActiveView(self.camera, render, Region(grid, self.blocks))
+
+
+def responsibility(
+    gaussians: Gaussians, changed_views: ChangedViews, min_weight: float, width: int = 640
+) -> np.ndarray:
+    """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden
+    ones.
+
+    Args:
+        gaussians: N Gaussians of the previous frame, detached.
+        changed_views: V views with the boxes of these Gaussians.
+        min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian
+            counts as hidden.
+        width: views are reduced by the largest whole factor that leaves this width, in px.
+    """
+    render = changed_views.render
+    reduced = [_ReducedView.of(view, width, render) for view in changed_views.views]
+    changed = [view for view in reduced if view.blocks.any()]
+    if not changed:
+        return np.zeros(len(gaussians), np.float32)
+    # Blend weights summed over changed pixels, and over all in their blocks, in px of the view.
+    group = ViewGroup([view.drawn(render) for view in changed])
+    areas = [np.full(np.count_nonzero(view.blocks), view.factor**2) for view in changed]
+    pixel_area = np.concatenate(areas)[:, None, None]
+    share = group.crop([view.share for view in changed])
+    maps = np.stack([pixel_area * share, np.broadcast_to(pixel_area, share.shape)], axis=-1)
+    change_weight, weight = group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
+    visible = weight > min_weight
+    # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
+    # view.
+    boxes = changed_views.boxes
+    area = boxes.total(boxes.area)
+    sides = np.outer([view.factor for view in reduced], block_shape(render))
+    blocks = stacked([view.blocks for view in reduced])
+    near = boxes.total(boxes.within(blocks, sides))
+    area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
+    return visible * change_weight / np.maximum(weight * area_ratio, 1e-30)
+
+
+def overlap(changed_views: ChangedViews) -> np.ndarray:
+    """Return the overlap o [N] of each Gaussian with the changes, from 0 to 1; 0 for one that is in
+    no view.
+    """
+    boxes = changed_views.boxes
+    near = boxes.within(changed_views.counts > 0, boxes.sides)
+    shares = boxes.total(near / dr.maximum(boxes.area, 1))
+    counts = boxes.total(dr.select(boxes.area > 0, mi.Float(1), 0))
+    return np.asarray(shares / dr.maximum(counts, 1))
 
 
 @config_class
@@ -264,8 +280,7 @@ def full_active_set(
 
 def find_active_set(
     gaussians: Gaussians,
-    cameras: Mapping[int, Camera],
-    changes: Mapping[int, np.ndarray] | None,
+    views: Mapping[int, ChangedView],
     render: RenderConfig,
     config: ActiveSetConfig,
 ) -> ActiveSet:
@@ -273,18 +288,16 @@ def find_active_set(
 
     Args:
         gaussians: N Gaussians of the previous frame, detached.
-        cameras: V cameras, by view index.
-        changes: masks of their changed pixels, bool [H, W], by view index; None: all may have
-            changed.
+        views: V views with their changed pixels, by view index.
         render: cut-offs.
         config: settings.
     """
-    if not cameras:
+    if not views:
         return ActiveSet(np.arange(0), len(gaussians), {}, 0)
-    if changes is None or sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
+    cameras = {v: view.camera for v, view in views.items()}
+    if sum(view.change.mean() for view in views.values()) > _MOST_CHANGED * len(views):
         return full_active_set(gaussians, cameras, render)
-    views = [*cameras.values()]
-    changed_views = ChangedViews.of(gaussians, views, [changes[v] for v in cameras], render)
+    changed_views = ChangedViews.of(gaussians, [*views.values()], render)
     shares = responsibility(gaussians, changed_views, config.min_weight)
     active = shares > config.min_responsibility
     active &= overlap(changed_views) > _MIN_OVERLAP
@@ -293,7 +306,7 @@ def find_active_set(
     active |= _inside_unexplained(changed_views, active)
     # Those that hardly change are drawn in some views only.
     drawn = np.tile(active & (shares > QUIET), (len(views), 1))
-    drawn[[*choose_key_views(views, config.quiet_views)]] = active
+    drawn[[*choose_key_views([*cameras.values()], config.quiet_views)]] = active
     boxes = changed_views.boxes
     drawn_blocks = boxes.union(drawn) | (changed_views.counts > 0)
     active_views = {}

@@ -4,25 +4,21 @@ refinement.
 A stage returns a better start from the one before. `STARTS` has them in their order, by the
 settings that switch them off.
 
-Motion proposals from neighbours, where lifted flow fails.
-
-Flow fails where parts are thin and fast, or look alike. But neighbours share their motion. So in
-each round, a Gaussian gets the motion of a random one of its nearest moving neighbours as a
-proposal, as pixels do in PatchMatch (Barnes et al. 2009). All Gaussians try their proposals at once
-and are rendered in the key views. With the attributed error E_iv and the coverage W_iv there (see
-`error_per_gaussian`), the error of a Gaussian is
+**Proposals.** Flow fails where parts are thin and fast, or look alike. But neighbours share their
+motion. So in each round, a Gaussian gets the motion of a random one of its nearest moving
+neighbours as a proposal, as pixels do in PatchMatch (Barnes et al. 2009). All Gaussians try their
+proposals at once and are rendered in the key views. With the attributed error E_iv and the coverage
+W_iv there (see `error_per_gaussian`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
 A Gaussian accepts a proposal that clearly lowers its error. Only the surroundings of Gaussians that
 may move are rendered.
 
-Photometric refinement of a frame's start: displacement and colour in closed form, from the key
-views' images.
-
-Beyond the paper. Lifted flow is a fraction of a pixel off, which the few steps of a later frame
-hardly correct. With the blend weights w fixed, the error e = target - image of a view is linear in
-a Gaussian's displacement (Lucas and Kanade 1981): displaced by delta, it shifts its pixels by J
+**Refinement** of displacement and colour in closed form, from the key views' images; beyond the
+paper. Lifted flow is a fraction of a pixel off, which the few steps of a later frame hardly
+correct. With the blend weights w fixed, the error e = target - image of a view is linear in a
+Gaussian's displacement (Lucas and Kanade 1981): displaced by delta, it shifts its pixels by J
 delta, and with the target's gradient g, per colour component,
 
     e + g . J delta = 0 .
@@ -51,20 +47,28 @@ from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.types import Arrays
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
-from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import LOGIT, lift_flow
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
 from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.search import search_motion
 from morgs_mi.method.sweep import relative_error
 
-# Nearest Gaussians. Their pixels count, too, if they move: a small Gaussian alone may cover one
-# straight edge.
+# Rounds of proposals: in two, a motion reaches neighbours of neighbours.
+_ROUNDS = 2
+# Nearest Gaussians that a proposal is drawn from.
+_NEIGHBOURS = 8
+# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves
+# otherwise and if not. Others move at the same time: a smaller gain is chance.
+_ERROR_RATIO = 0.9
+_ERROR_RATIO_STATIC = 0.8
+# Nearest Gaussians whose pixels count in a refinement, too, if they move: a small Gaussian alone
+# may cover one straight edge.
 _NEAREST = 8
-# Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px.
+# Weight of the prior that this step is 0, in pixels on which the contrast is 1 per px.
 _PRIOR_PIXELS = 1e-3
-# Longest step, in px of the view where it is longest: farther away, the image is not linear.
+# Longest step of a refinement, in px of the view where it is longest: farther away, the image is
+# not linear.
 LONGEST_PX = 2.0
 # Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is
 # noise.
@@ -126,19 +130,6 @@ def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarr
     return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]
 
 
-# Rounds of proposals.
-_ROUNDS = 2
-# Nearest Gaussians that a proposal is drawn from.
-_NEIGHBOURS = 8
-# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves
-# otherwise and if not. Others move at the same time: a smaller gain is chance.
-_ERROR_RATIO = 0.9
-_ERROR_RATIO_STATIC = 0.8
-# Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by
-# chance.
-_LOGIT = 0.3
-
-
 def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """Return a start of the motion that explains the images at least as well as `start` does.
 
@@ -172,7 +163,9 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         is_better = differs & (new_error < ratio * error)
         d = np.where(is_better[:, None], proposal, d)
         error = np.where(is_better, new_error, error)
-        accepted = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
+        moving = np.maximum(logit, SOFT_LOGIT)
+        still = np.minimum(logit, -SOFT_LOGIT)
+        accepted = np.where(d.any(axis=1), moving, still)
         logit = np.where(is_better, accepted, logit)
     return MotionStart(d, logit.astype(np.float32))
 
@@ -189,7 +182,6 @@ def initial_motion(
     previous: Gaussians,
     active: ActiveSet,
     views: Mapping[int, ObservedView],
-    flows: Mapping[int, FlowObservation],
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> MotionStart | None:
@@ -200,8 +192,7 @@ def initial_motion(
     Args:
         previous: N Gaussians of the previous frame, detached.
         active: the M active ones.
-        views: the active views with their images, by view index.
-        flows: optical flow of the key views, by view index.
+        views: the active views with their images, and of key views the flow, by view index.
         config: which modules are on.
         rng: draws the neighbours that proposals come from.
     """
@@ -213,8 +204,8 @@ def initial_motion(
         if not config.constant_velocity or gaussians.motion is None:
             return start if config.constant_velocity else None
         return replace(start, displacement=np.asarray(gaussians.motion))
-    key_views = {v: views[v] for v in sorted(flows.keys() & views.keys())}
-    problem = MotionProblem(gaussians, key_views, rng, flows)
+    key_views = {v: views[v] for v in sorted(views) if views[v].flow is not None}
+    problem = MotionProblem(gaussians, key_views, rng)
     for name, stage in STARTS.items():
         if getattr(config, name):
             start = stage(problem, start, config)

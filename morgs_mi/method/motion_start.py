@@ -17,6 +17,11 @@ from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.sweep import MAPS, KeyImages
 
+SOFT_LOGIT = 0.3
+"""Logit of the confidence of a Gaussian that moves by a proposal or the search: 0.57, as some
+accept a wrong motion by chance.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class MotionStart:
@@ -47,9 +52,12 @@ class MotionProblem:
     gaussians: Gaussians
     views: Mapping[int, ObservedView]  #: Active views with their images, by view index.
     rng: np.random.Generator  #: Draws the neighbours that proposals come from.
-    #: Optical flow of the views, by view index.
-    flows: Mapping[int, FlowObservation] = field(default_factory=dict)
     _last: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def flows(self) -> dict[int, FlowObservation]:
+        """Optical flow of the views, by view index."""
+        return {v: view.flow for v, view in self.views.items() if view.flow is not None}
 
     @cached_property
     def neighbours(self) -> NeighbourIndex:

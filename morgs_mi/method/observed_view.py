@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
+import mitsuba as mi
+
+from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.types import Arrays
+from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
@@ -15,9 +21,23 @@ class ObservedView(ActiveView):
 
     target: Target = field(kw_only=True)  #: The image.
     observed: Arrays = field(default_factory=dict)  #: Observations [H, W, ...] by name.
+    flow: FlowObservation | None = None  #: Optical flow of a key view; None of any other.
+
+    @cached_property
+    def observations(self) -> dict[str, Any]:
+        """What renderings are compared with, by name: the target, and tensors on the region."""
+        cropped = {name: self.crop(image) for name, image in self.observed.items()}
+        tensors = {name: from_numpy(mi.TensorXf, image) for name, image in cropped.items()}
+        return {"target": self.target, **tensors}
 
     @classmethod
-    def of(cls, view: ActiveView, target: Target, observed: Arrays | None = None) -> ObservedView:
-        """Return a view with an image, and with observations [H, W, ...] by name."""
+    def of(
+        cls,
+        view: ActiveView,
+        target: Target,
+        observed: Arrays | None = None,
+        flow: FlowObservation | None = None,
+    ) -> ObservedView:
+        """Return a view with an image, and a key view with its observations and flow."""
         drawn = (view.camera, view.config, view.region, view.static_splats)
-        return cls(*drawn, target=target, observed=observed or {})
+        return cls(*drawn, target=target, observed=observed or {}, flow=flow)

@@ -33,10 +33,13 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.cohesion import NeighbourIndex
-from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
 from morgs_mi.platform.config import NonNegativeInt, config_class
 
-_GRID = 16  # steps of the grid from 0 to its end, in each direction of each axis
+# Steps of the grid from 0 to its end, in each direction of each axis: it has 36,000 places.
+_GRID = 16
+# Parts that are rendered at once, each in a colour of its own.
+_COLORS = 3
 # Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above
 # which it is not explained.
 _UNEXPLAINED = 3.0
@@ -49,8 +52,6 @@ _COST_RATIO = 0.3
 # Error of the images around a part, relative to the error without the displacement, up to which it
 # is accepted.
 _ERROR_RATIO = 0.8
-# Logit of the confidence of a Gaussian that was found, see `motion`.
-_LOGIT = 0.3
 
 
 @config_class
@@ -78,11 +79,9 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
     logit = start.logit_confidence
     gaussians = problem.gaussians
     parts = _unexplained_parts(problem, displacement, config.max_parts)
-    surfaces = [
-        part_surfaces
-        for first in range(0, len(parts), 3)
-        for part_surfaces in _cost_surfaces(problem, parts[first : first + 3], config.reach)
-    ]
+    surfaces = []
+    for first in range(0, len(parts), _COLORS):
+        surfaces += _cost_surfaces(problem, parts[first : first + _COLORS], config.reach)
     for part, part_surfaces in zip(parts, surfaces, strict=True):
         center = np.asarray(gaussians.means)[part].mean(axis=0)
         d = _best_displacement(center, part_surfaces, config.reach)
@@ -92,12 +91,11 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         images = problem.images_around(part, [displacement, proposal])
         if images is None:
             continue
-        old_error, new_error = (
-            images.total_error(displaced(gaussians, at)) for at in (displacement, proposal)
-        )
+        old_error = images.total_error(displaced(gaussians, displacement))
+        new_error = images.total_error(displaced(gaussians, proposal))
         if new_error < _ERROR_RATIO * old_error:
             displacement = proposal
-            logit = np.where(part, np.maximum(logit, _LOGIT), logit)
+            logit = np.where(part, np.maximum(logit, SOFT_LOGIT), logit)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))

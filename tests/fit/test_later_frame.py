@@ -119,8 +119,7 @@ def test_initial_motion__continues_with_constant_velocity():
     rng = np.random.default_rng(0)
     active = full_active_set(previous_gaussians, dict(enumerate(views())), RENDER)
     active_views = observed(active.views, images_of(opaque_ball()))
-    assert initial_motion(previous_gaussians, active, active_views, {}, PLAIN, rng) is None
-    start = initial_motion(
-        previous_gaussians, active, active_views, {}, replace(PLAIN, constant_velocity=True), rng
-    )
+    assert initial_motion(previous_gaussians, active, active_views, PLAIN, rng) is None
+    constant = replace(PLAIN, constant_velocity=True)
+    start = initial_motion(previous_gaussians, active, active_views, constant, rng)
     assert np.array_equal(start.displacement, np.full((400, 3), 0.1, np.float32))

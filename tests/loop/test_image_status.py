@@ -1,9 +1,14 @@
 """Problems of images: of one colour, and cuts; motion, noise, light and exposure are none."""
 
+from itertools import zip_longest
+
 import numpy as np
 import pytest
 
+from morgs_mi.core.camera import Camera
 from morgs_mi.loop.input_images import image_status
+from morgs_mi.loop.seen_view import SeenView, ViewHistory
+from morgs_mi.method.exposure import Exposure
 
 H = 48
 W = 64
@@ -22,11 +27,28 @@ def noisy(image, sigma, seed=0):
     )
 
 
-def views(*images):
-    return dict(enumerate(images))
+RIG = (scene(0), scene(1), scene(2))
 
 
-RIG = views(scene(0), scene(1), scene(2))
+def status(images, previous=()):
+    """Return the status of images, and of those of the frame before, by view."""
+    views = []
+    for index, (image, last) in enumerate(zip_longest(images, previous)):
+        if image is None:
+            continue
+        camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 50, W, H, NAMES[index])
+        views.append(
+            SeenView(
+                camera,
+                image,
+                index=index,
+                recorded=image,
+                previous=last,
+                change=np.zeros((H, W), bool),
+                history=ViewHistory(image, image, Exposure()),
+            )
+        )
+    return image_status(views)
 
 
 @pytest.mark.parametrize(
@@ -39,18 +61,18 @@ RIG = views(scene(0), scene(1), scene(2))
     ],
 )
 def test_image_status__names_views_of_one_colour(image, words):
-    for previous_status in ({}, RIG):
-        (problem,) = image_status(NAMES, previous_status, {**RIG, 1: image})
+    for previous in ((), RIG):
+        (problem,) = status((RIG[0], image, RIG[2]), previous)
         assert problem.startswith(words)
         assert "--exclude" in problem
 
 
 def test_image_status__names_a_cut_of_all_views_or_of_one():
-    (problem,) = image_status(NAMES, RIG, views(scene(3), scene(4), scene(5)))
+    (problem,) = status((scene(3), scene(4), scene(5)), RIG)
     assert problem.startswith(
         "the images show another scene than in the frame before; end the fit before this frame"
     )
-    (problem,) = image_status(NAMES, RIG, {**RIG, 2: scene(6)})
+    (problem,) = status((*RIG[:2], scene(6)), RIG)
     assert problem.startswith("c: the image shows something else than in the frame before")
 
 
@@ -73,12 +95,9 @@ def with_object(column):
     ],
 )
 def test_image_status__is_empty_for_motion_noise_and_light(previous, current):
-    assert (
-        image_status(NAMES, views(previous, previous, previous), views(current, current, current))
-        == ()
-    )
+    assert status(3 * [current], 3 * [previous]) == ()
 
 
 def test_image_status__compares_views_that_have_both_images():
-    assert image_status(NAMES, {0: RIG[0]}, {1: RIG[1]}) == ()
-    assert image_status(NAMES, {}, {}) == ()
+    assert status((None, RIG[1]), RIG[:1]) == ()
+    assert status(()) == ()

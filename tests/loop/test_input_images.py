@@ -121,9 +121,10 @@ def observed(images, history=None, **kwargs):
 
 def test_observe_frame__keeps_light_for_the_fit_and_shows_8_bits():
     result = observed([LIGHT], display_exposure=-1.0)
-    assert_array_equal(result.encoded[0], encode_light(LIGHT))
-    assert result.encoded[0].dtype == np.float32
-    assert_array_equal(result.history.images[0], display_image(LIGHT, -1))
+    view = result.views[0]
+    assert_array_equal(view.encoded, encode_light(LIGHT))
+    assert view.encoded.dtype == np.float32
+    assert_array_equal(view.image, display_image(LIGHT, -1))
 
 
 def test_observe_frame__first_frame_determines_the_display_exposure():
@@ -136,5 +137,6 @@ def test_observe_frame__first_frame_determines_the_display_exposure():
 
 def test_observe_frame__bytes_are_compared_and_shown_alike():
     result = observed([GREY])
-    assert result.encoded[0] is result.history.images[0]
-    assert_array_equal(result.encoded[0], GREY)
+    view = result.views[0]
+    assert view.encoded is view.image
+    assert_array_equal(view.encoded, GREY)

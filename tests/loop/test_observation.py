@@ -19,6 +19,6 @@ def test_observe_frame__has_masks_where_their_loss_has_a_weight(weight):
     for frame in capture.partial_frames(0, 2):
         observation = observe_frame(setup, frame.index, history, frame.images)
         history = observation.history
-    assert observation.flows
-    for flow in observation.flows.values():
-        assert (flow.mask is None) == (weight == 0)
+    assert observation.key_views
+    for view in observation.key_views.values():
+        assert (view.flow.mask is None) == (weight == 0)

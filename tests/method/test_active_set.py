@@ -11,7 +11,13 @@ from numpy.testing import assert_array_equal
 from morgs_mi import RenderConfig, rasterize
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
-from morgs_mi.method.active_set import ActiveSet, ActiveSetConfig, find_active_set, full_active_set
+from morgs_mi.method.active_set import (
+    ActiveSet,
+    ActiveSetConfig,
+    ChangedView,
+    find_active_set,
+    full_active_set,
+)
 from morgs_mi.method.motion_config import MotionConfig
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -67,7 +73,8 @@ def changes(previous, current):
 
 
 def found(gaussians, changed, config=CONFIG):
-    active = find_active_set(gaussians, cameras(), changed, RENDER, config)
+    views = {v: ChangedView(camera, change=changed[v]) for v, camera in cameras().items()}
+    active = find_active_set(gaussians, views, RENDER, config)
     return active.with_static(gaussians, ("color",))
 
 

@@ -32,9 +32,9 @@ def start(config, with_flow=True):
         is_reliable = np.ones(flow.shape[:2], bool)
         if with_flow:
             flows[v] = FlowObservation(flow, is_reliable, flow, is_reliable)
-    seen = rendered_as(moved_gaussians, active.views)
+    seen = rendered_as(moved_gaussians, active.views, flows)
     rng = np.random.default_rng(0)
-    return initial_motion(previous_gaussians, active, seen, flows, config, rng)
+    return initial_motion(previous_gaussians, active, seen, config, rng)
 
 
 def test_initial_motion__runs_the_stages_that_are_on():

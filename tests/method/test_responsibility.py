@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from morgs_mi import RenderConfig
-from morgs_mi.method.active_set import ChangedViews, overlap, responsibility
+from morgs_mi.method.active_set import ChangedView, ChangedViews, overlap, responsibility
 from morgs_mi.render.active_view import ActiveView, backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -28,7 +28,8 @@ def gaussians():
 
 
 def changed_views(gaussians, changes):
-    return ChangedViews.of(gaussians, [*CAMERAS.values()], [*changes.values()], RENDER)
+    views = [ChangedView(CAMERAS[view], change=change) for view, change in changes.items()]
+    return ChangedViews.of(gaussians, views, RENDER)
 
 
 def responsibility_for(gaussians, changes, width=640):

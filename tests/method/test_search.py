@@ -129,9 +129,8 @@ def test_initial_motion__searches_where_flow_sees_nothing(scene):
     for searches in (True, False):
         config = MotionConfig(search_motion=searches)
         rng = np.random.default_rng(0)
-        initial = initial_motion(
-            gaussians, active, rendered_as(moved(gaussians), views), flows, config, rng
-        )
+        seen = rendered_as(moved(gaussians), views, flows)
+        initial = initial_motion(gaussians, active, seen, config, rng)
         assert initial.displacement[MOVES].any() == searches
 
 

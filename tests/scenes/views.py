@@ -19,9 +19,10 @@ def observed(views, images):
     return {v: ObservedView.of(views[v], Target(image)) for v, image in enumerate(images)}
 
 
-def rendered_as(gaussians, views):
-    """Return active views, by index, with images of Gaussians."""
-    return {
-        v: ObservedView.of(view, Target(np.asarray(render_view(gaussians, view).color)))
-        for v, view in views.items()
-    }
+def rendered_as(gaussians, views, flows=None):
+    """Return active views, by index, with images of Gaussians, and with the flow of key views."""
+    seen = {}
+    for v, view in views.items():
+        target = Target(np.asarray(render_view(gaussians, view).color))
+        seen[v] = ObservedView.of(view, target, flow=(flows or {}).get(v))
+    return seen

@@ -241,6 +241,10 @@ def fit_boundary_frame(
         coded = state.coded
         assert coded is not None
         # Changes are relative to the common model again.
-        history = replace(common.history, images=state.history.images)
+        views = {
+            v: replace(common.history.views.get(v, view), image=view.image)
+            for v, view in state.history.views.items()
+        }
+        history = replace(common.history, views=views)
         seconds += report.seconds
     return coded, replace(report, seconds=seconds)
