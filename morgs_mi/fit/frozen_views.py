@@ -12,6 +12,7 @@ import numpy as np
 
 from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.attributes import BY_NAME, sigmoid
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Float, Jit, Tensors, UInt32
 from morgs_mi.fit.frozen_step import Draw, Inputs, Losses, RecordedSteps, StepView, room_for
@@ -44,7 +45,7 @@ from morgs_mi.render.padded_region import (
 )
 from morgs_mi.render.projection import Splats, TracedCamera, intrinsics_of, project
 from morgs_mi.render.rasterize import Output, draw
-from morgs_mi.render.region import full_view
+from morgs_mi.render.region import Region, full_view
 from morgs_mi.render.render_config import RenderConfig
 
 # Row past the last of a run of windows that walks no row.
@@ -106,7 +107,8 @@ class LaterLosses:
         detached = tuple(name for name in channels if name != "color")
         output = Output(channels, detached, self.render, region.shape(0)[:-1])
         static = Splats(**view["static"])
-        first, count = (elements(view["static_range"], mi.UInt32(k)) for k in range(2))
+        first = elements(view["static_range"], mi.UInt32(0))
+        count = elements(view["static_range"], mi.UInt32(1))
         with dr.suspend_grad():
             drawn = splats.followed_by(static, first, count, self.num_static)
         image, lists = draw(output, splats, drawn, region)
@@ -171,51 +173,55 @@ def with_dropout(gaussians: Gaussians, probability: float, is_kept: UInt32) -> G
     return replace(gaussians, logit_opacities=mi.TensorXf(logits))
 
 
-class StepViews:
-    """Views as arguments of recorded steps, of the same sizes where their images have the same.
+@dataclass(frozen=True, eq=False)
+class ComparedView:
+    """A view as a recorded step draws and compares it."""
+
+    camera: Camera  #: The view.
+    region: Region  #: The blocks that are drawn.
+    on: Comparison  #: The target there.
+
+    @classmethod
+    def of(cls, view: ObservedView) -> ComparedView:
+        """Return an active view, or a whole one, with its image."""
+        region = view.region or full_view(*view.grid.size, view.grid.block, 1, mi.variant())
+        on = view.target.comparison(None if region.whole else region)
+        return cls(view.camera, region, on)
+
+
+class Rooms:
+    """Sizes that the arrays of all views of a frame fit in: views whose images have the same size
+    have the same sizes.
 
     Args:
-        views: V >= 1 views, or active views, with their images, by index.
-
-    Attributes:
-        regions: the blocks that are drawn in each view.
+        views: V >= 1 views.
     """
 
-    def __init__(self, views: Mapping[int, ObservedView]) -> None:
-        self.regions = {
-            v: view.region or full_view(*view.grid.size, view.grid.block, 1, mi.variant())
-            for v, view in views.items()
-        }
-        regions = self.regions.values()
-        self._views = views
-        self._comparisons = {
-            v: views[v].target.comparison(None if region.whole else region)
-            for v, region in self.regions.items()
-        }
+    def __init__(self, views: Sequence[ComparedView]) -> None:
+        regions = [view.region for view in views]
         parts = [region.num_blocks for region in regions if not region.whole]
         self._blocks = room_for("blocks", max(parts)) if parts else 0
         self._tiles = room_for("tiles", max(region.num_tiles for region in regions) + 1)
-        runs = [on.runs for on in self._comparisons.values()]
         self._lanes = {
-            name: room_for(name, max(len(lanes[name]["end"]) for lanes in runs)) for name in runs[0]
+            name: room_for(name, max(len(view.on.runs[name]["end"]) for view in views))
+            for name in views[0].on.runs
         }
         self._is_partial = any(region.weights is not None for region in regions)
 
-    def sizes(self, v: int) -> PaddedSizes:
-        """Return the sizes of a view, without a capacity."""
-        region = self.regions[v]
+    def sizes(self, region: Region) -> PaddedSizes:
+        """Return the sizes of a view's region, without a capacity."""
         blocks = region.num_blocks if region.whole else self._blocks
         is_partial = self._is_partial and not region.whole
         return PaddedSizes(region.grid, region.whole, blocks, self._tiles, is_partial, capacity=0)
 
-    def arrays(self, v: int) -> tuple[Packing, dict[str, Any]]:
+    def arrays(self, view: ComparedView) -> tuple[Packing, dict[str, Any]]:
         """Return the arrays of a view: its camera, region and target, and the places of most of
         them in ``words``.
         """
-        region = self.regions[v]
-        camera = self._views[v].camera
-        on = self._comparisons[v]
-        numbers = padded_arrays(region, self.sizes(v))
+        region = view.region
+        camera = view.camera
+        on = view.on
+        numbers = padded_arrays(region, self.sizes(region))
         for name, runs in on.runs.items():
             for key, values in runs.items():  # what fills them up walks no row
                 fill = _NO_ROWS if key == "end" else 0
@@ -251,10 +257,12 @@ class LaterSteps:
         self._num_static = room_for("static splats", max(map(len, statics), default=0))
         self._objective = objective
         self._views: dict[int, StepView] = {}
-        step_views = StepViews(views)
-        for v, view in views.items():
-            region = step_views.regions[v]
-            sizes = step_views.sizes(v)
+        compared_views = {v: ComparedView.of(view) for v, view in views.items()}
+        rooms = Rooms([*compared_views.values()])
+        for v, compared_view in compared_views.items():
+            view = views[v]
+            region = compared_view.region
+            sizes = rooms.sizes(region)
             images = {name: view.crop(array) for name, array in view.observed.items()}
             observed = {"target": None, **images}
             channels = channels_of(observed, objective)
@@ -262,7 +270,7 @@ class LaterSteps:
                 name: image.shape if region.whole else (sizes.num_blocks, *image.shape[1:])
                 for name, image in images.items()
             }
-            packing, arrays = step_views.arrays(v)
+            packing, arrays = rooms.arrays(compared_view)
             static = view.static_splats or _no_static(channels)
             arrays["static"] = _columns(static.together, channels)
             arrays["static_range"] = from_numpy(mi.UInt32, [static.first, static.count])
@@ -319,13 +327,15 @@ class FirstSteps:
         dropout: float,
         rng: np.random.Generator,
     ) -> None:
-        step_views = StepViews(dict(enumerate(views)))
+        compared_views = [ComparedView.of(view) for view in views]
+        rooms = Rooms(compared_views)
+        render = views[0].config
         self._views: dict[int, StepView] = {}
-        for v, view in enumerate(views):
-            packing, arrays = step_views.arrays(v)
-            losses = FirstLosses(packing, dssim_weight, dropout, view.config)
+        for v, view in enumerate(compared_views):
+            packing, arrays = rooms.arrays(view)
+            losses = FirstLosses(packing, dssim_weight, dropout, render)
             names = ("recon", SQUARED_ERROR)
-            self._views[v] = StepView(losses, names, step_views.sizes(v), arrays)
+            self._views[v] = StepView(losses, names, rooms.sizes(view.region), arrays)
         self._dropout = dropout
         self._rng = rng
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.arrays import from_numpy, opaque
+from morgs_mi.core.arrays import opaque
 from morgs_mi.core.gaussians import Gaussians, at_rest, displaced
 from morgs_mi.core.types import Tensors
 from morgs_mi.fit.density import DensityControl, apply_plan
-from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig, LearningRates
+from morgs_mi.fit.frozen_step import RecordedSteps
 from morgs_mi.fit.frozen_views import LaterSteps, is_recordable
 from morgs_mi.fit.optimise import (
+    FINAL_RATE,
     Steps,
     adam,
     fit_problem,
@@ -32,7 +34,6 @@ from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, moved
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.objective import (
     SQUARED_ERROR,
-    Observations,
     Prediction,
     channels_of,
     losses_of,
@@ -47,8 +48,6 @@ from morgs_mi.render.rasterize import check_rendering, render_view
 # Fraction of the epochs after which the round of density control is due: the residual has shown by
 # then where Gaussians are missing, and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
-# Learning rates of a motion model at the end, as a fraction of those at the start.
-_FINAL_RATE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +61,11 @@ class FrameProblem:
     #: motion, and all else as before.
     start: MotionStart | None
     extent: float  #: Extent of the scene in world units.
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """The active Gaussians of the previous frame."""
+        return self.active.select(self.previous)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,21 +109,8 @@ def fit_later_frame(
         source = np.arange(len(problem.previous))
         return LaterFrame(at_rest(problem.previous), source, {}, 0, np.nan, "")
     progress = progress or Progress()
-    objective = config.objective
     indices = sorted(views)
     order = [indices[k] for k in view_order(count, config.epochs * count, rng)]
-
-    @cache
-    def observed_in(index: int) -> Observations:
-        """Return what a view is compared with, as tensors on its region."""
-        view = views[index]
-        images = view.observed.items()
-        tensors = {name: from_numpy(mi.TensorXf, view.crop(array)) for name, array in images}
-        return {"target": view.target, **tensors}
-
-    previous = active.select(problem.previous)
-    source = np.arange(len(active.indices))
-    scores: ErrorPerGaussian | None = None  # None: the epoch collects none
 
     def steps_of(epoch: int, epochs: int = 1) -> Steps:
         """Return the steps of some epochs, one in every active view per epoch."""
@@ -127,21 +118,147 @@ def fit_later_frame(
             order[epoch * count : (epoch + epochs) * count],
             epoch * count,
             on_step=lambda step: progress(step, len(order)),
-            observer=scores,
             averaged_steps=count,
         )
 
-    def gaussians() -> Gaussians:
+    start = problem.start
+    losses = dict[str, float]()
+    psnr = np.nan
+    model_epochs = 0
+    factory = MOTION_MODELS.make(motion.model, motion)
+    if factory is not None:  # the Gaussians move together first
+        model_epochs = max(1, round(motion.model_share * config.epochs))
+        model = factory(problem.gaussians, problem.extent, rng)
+        steps = steps_of(0, model_epochs)
+        start, losses = _fit_motion(problem, model, steps, config.objective.dssim_weight)
+    fit = _ResidualFit(problem, start, config, motion)
+    density_epoch = _density_epoch(config, model_epochs)
+    for epoch in range(model_epochs, config.epochs):
+        if epoch == density_epoch:
+            fit.density_round(rng)
+        is_scored = epoch + 1 == density_epoch
+        losses = fit.epoch(steps_of(epoch), config.rates_at(epoch), is_scored)
+        psnr = pop_psnr(losses)
+    gaussians, source = active.merge(problem.previous, fit.checked_gaussians(), fit.source)
+    constant_errors = (view.target.constant_error(view.region) for view in views.values())
+    problem_text = fit_problem(psnr, constant_errors)
+    return LaterFrame(gaussians, source, losses, len(order), psnr, problem_text)
+
+
+def _density_epoch(config: FitConfig, model_epochs: int) -> int | None:
+    """Return the epoch before which density control acts; None: it does not.
+
+    It comes after an epoch of the residual, which shows where to add Gaussians.
+    """
+    epoch = max(round(_DENSITY_ROUND * config.epochs), model_epochs + 1)
+    return epoch if config.density.later_frames and epoch < config.epochs else None
+
+
+class _ResidualFit:
+    """Fit of the residual of the active Gaussians, epoch by epoch.
+
+    Args:
+        problem: input of the fit.
+        start: of the residual.
+        config: weights of the losses, density control.
+        motion: which parts of the method are on.
+
+    Attributes:
+        source: int [N], index of each Gaussian among the active ones of the previous frame; -1 for
+            births, which come last.
+    """
+
+    def __init__(
+        self,
+        problem: FrameProblem,
+        start: MotionStart | None,
+        config: FitConfig,
+        motion: MotionConfig,
+    ) -> None:
+        self._problem = problem
+        self._config = config
+        self._motion = motion
+        # The Gaussians before the residual; a birth has the past of its parent.
+        self._previous = problem.gaussians
+        self.source = np.arange(len(self._previous))
+        # Densification scores of the epoch; None: it has none.
+        self._scores: ErrorPerGaussian | None = None
+        parameters = residual_parameters(self._previous, motion, start)
+        self._optimizer = adam(parameters, config.momentum)
+        self._later_steps = None
+        if is_recordable(problem.views.values(), config.objective):
+            views = problem.views
+            self._later_steps = LaterSteps(views, self._optimizer, config.objective, motion)
+        self._recorded_steps = self._recorded()
+
+    def _recorded(self) -> RecordedSteps | None:
+        """Return the steps of the active Gaussians as recordings; None if these do not exist."""
+        if self._later_steps is None:
+            return None
+        problem = self._problem
+        return self._later_steps.of(self._previous, problem.active.num_gaussians, problem.extent)
+
+    def epoch(self, steps: Steps, rates: LearningRates, is_scored: bool) -> dict[str, float]:
+        """Make the steps of an epoch, and return their mean losses by name.
+
+        Args:
+            steps: one in every active view.
+            rates: learning rates.
+            is_scored: whether densification scores are collected, for the next `density_round`.
+        """
+        if is_scored:
+            # In the last quarter: an error that is seen earlier may be gone by the end of the
+            # epoch.
+            count = len(self._problem.views)
+            self._scores = ErrorPerGaussian(len(self.source), count - (count + 3) // 4)
+        return optimise(
+            self._optimizer,
+            rates.by_parameter(self._problem.extent),
+            self._losses_at,
+            replace(steps, observer=self._scores),
+            weights_of(self._config.objective),
+            self._recorded_steps,
+        )
+
+    def density_round(self, rng: np.random.Generator) -> None:
+        """Prune and add Gaussians where the scores of the last epoch are largest."""
+        assert self._scores is not None
+        problem = self._problem
+        num_static = len(problem.previous) - len(problem.active.indices)
+        control = DensityControl((), self._config.density, problem.extent, rng)
+        control.scores = np.asarray(self._scores.scores)
+        plan = control.step_later(self._optimizer, self._gaussians(), num_static)
+        # The optimiser has the residual, so the plan changes the previous Gaussians: a birth starts
+        # from the past of its parent, and shares its residual.
+        self._previous = apply_plan(self._previous, plan)
+        self.source = plan.source
+        self._scores = None
+        self._recorded_steps = self._recorded()
+
+    def _gaussians(self) -> Gaussians:
         """Return the active Gaussians after the residual."""
         with dr.suspend_grad():
-            return apply_residual(previous, values_of(optimizer), motion)
+            return apply_residual(self._previous, values_of(self._optimizer), self._motion)
 
-    def losses_at(parameters: Tensors, index: int) -> Tensors:
+    def checked_gaussians(self) -> Gaussians:
+        """Return the active Gaussians after the residual, with the checks of a rendering, which
+        recordings do not have.
+        """
+        gaussians = self._gaussians()
+        if self._later_steps is not None:
+            view = self._problem.views[min(self._problem.views)]
+            check_rendering(gaussians, view.camera, ("color", "motion"), view.config)
+        return gaussians
+
+    def _losses_at(self, parameters: Tensors, index: int) -> Tensors:
         """Render one view and return its losses by name."""
-        view = views[index]
-        observed = observed_in(index)
+        problem = self._problem
+        objective = self._config.objective
+        view = problem.views[index]
+        observed = view.observations
+        scores = self._scores
         channels = channels_of(observed, objective)
-        gaussians = apply_residual(previous, parameters, motion)
+        gaussians = apply_residual(self._previous, parameters, self._motion)
         features = None if scores is None else scores.features()
         # Motion, confidence and scores must not move opacity and geometry.
         names = channels if features is None else (*channels, "features")
@@ -156,86 +273,33 @@ def fit_later_frame(
             parameters,
             view.region,
             opaque(mi.Float, 1 / (view.camera.width * view.camera.height)),
-            opaque(mi.Float, 1 / (active.num_gaussians * problem.extent)),
+            opaque(mi.Float, 1 / (problem.active.num_gaussians * problem.extent)),
             problem.extent,
             gaussians,
-            previous,
+            self._previous,
         )
         losses = losses_of(prediction, observed, objective)
         return {**losses, SQUARED_ERROR: view.target.mse}
 
-    start = problem.start
-    losses = dict[str, float]()
-    model_epochs = 0
-    psnr = np.nan
-    factory = MOTION_MODELS.make(motion.model, motion)
-    if factory is not None:
-        model_epochs = max(1, round(motion.model_share * config.epochs))
-        model = factory(previous, problem.extent, rng)
-        steps = steps_of(0, model_epochs)
-        start, losses = _fit_motion(previous, problem, model, start, steps, objective.dssim_weight)
-    optimizer = adam(residual_parameters(previous, motion, start), config.momentum)
-    weights = weights_of(objective)
-    later_steps = None
-    if is_recordable(views.values(), objective):
-        later_steps = LaterSteps(views, optimizer, objective, motion)
-    recorded_steps = None
-    # The round comes after an epoch of the residual, which shows where to add Gaussians.
-    density_epoch = max(round(_DENSITY_ROUND * config.epochs), model_epochs + 1)
-    for epoch in range(model_epochs, config.epochs):
-        if scores is not None:
-            num_static = len(problem.previous) - len(active.indices)
-            control = DensityControl((), config.density, problem.extent, rng)
-            control.scores = np.asarray(scores.scores)
-            plan = control.step_later(optimizer, gaussians(), num_static)
-            # The optimiser has the residual, so the plan changes the previous Gaussians: a birth
-            # starts from the past of its parent, and shares its residual.
-            previous = apply_plan(previous, plan)
-            source = plan.source
-            recorded_steps = None
-            scores = None
-        elif config.density.later_frames and epoch == density_epoch - 1:
-            # Scores are collected in the last quarter: an error that is seen earlier may be gone by
-            # the end of the epoch.
-            scores = ErrorPerGaussian(len(source), count - (count + 3) // 4)
-        rates = config.rates_at(epoch).by_parameter(problem.extent)
-        if recorded_steps is None and later_steps is not None:
-            recorded_steps = later_steps.of(previous, active.num_gaussians, problem.extent)
-        losses = optimise(optimizer, rates, losses_at, steps_of(epoch), weights, recorded_steps)
-        psnr = pop_psnr(losses)
-    if later_steps is not None:
-        view = views[indices[0]]
-        check_rendering(gaussians(), view.camera, ("color", "motion"), view.config)
-    result, source = active.merge(problem.previous, gaussians(), source)
-    constant_errors = (view.target.constant_error(view.region) for view in views.values())
-    problem_text = fit_problem(psnr, constant_errors)
-    return LaterFrame(result, source, losses, len(order), psnr, problem_text)
-
 
 def _fit_motion(
-    gaussians: Gaussians,
-    problem: FrameProblem,
-    model: MotionModel,
-    start: MotionStart | None,
-    steps: Steps,
-    dssim_weight: float,
+    problem: FrameProblem, model: MotionModel, steps: Steps, dssim_weight: float
 ) -> tuple[MotionStart, dict[str, float]]:
     """Fit a motion model to the images by L_recon and the model's own losses.
 
     Args:
-        gaussians: N active Gaussians of the previous frame.
-        problem: the active views and their images.
-        model: of their motion.
-        start: displacement from which it starts, and colour from which the residual starts; None:
-            none.
+        problem: the active Gaussians and views. Its start has the displacement from which the
+            motion starts, and the colour from which the residual starts.
+        model: of the motion of the Gaussians.
         steps: the steps, from the first one of the frame.
         dssim_weight: lambda of eq. 2.
 
     Returns:
-        The start of the residual, with the confidence of `start` or of the previous frame, and the
-        losses by name, means over the last round of views.
+        The start of the residual, with the confidence of the problem's start or of the previous
+        frame, and the losses by name, means over the last round of views.
     """
-    start = start or MotionStart.without_motion(gaussians)
+    gaussians = problem.gaussians
+    start = problem.start or MotionStart.without_motion(gaussians)
     start_gaussians = displaced(gaussians, start.displacement)
 
     def losses_at(parameters: Tensors, index: int) -> Tensors:
@@ -249,7 +313,7 @@ def _fit_motion(
     optimizer = adam(model.parameters)
     total = len([*steps.views])
     # Adam's steps are as long as the rate; long ones find the motion, short ones settle it.
-    decaying_steps = replace(steps, rate_factor=lambda step: _FINAL_RATE ** (step / total))
+    decaying_steps = replace(steps, rate_factor=lambda step: FINAL_RATE ** (step / total))
     losses = optimise(optimizer, model.rates, losses_at, decaying_steps)
     with dr.suspend_grad():
         displacement, rotation = model.motion(values_of(optimizer))
