@@ -154,7 +154,7 @@ def _fit_later_frame(
         previous = with_first_confidence(setup, previous, observation.key_views, rng)
     objective = config.fit.objective
     seen_views = observation.views
-    active = find_active_set(previous, seen_views, config.render, motion.active_set)
+    active = find_active_set(previous, seen_views, config.render)
     # The optical flow, which is computed beside that.
     key_views = observation.key_views
     observations = observe(key_views, motion, objective)

@@ -134,13 +134,13 @@ _SHARES = "pixels that could be shares"
 
 BRANCHES: tuple[Branch, ...] = (
     # method.change
-    Branch(_CHANGES, "threshold by the noise", {"motion.change.sigmas": 0.0}),
+    Branch(_CHANGES, "threshold by the noise", {"method.change:_SIGMAS": 0.0}),
     Branch(
         _CHANGES,
         "noise of the surroundings",
         {"method.change:_noise_of_surroundings": lambda *_: np.zeros((1, 1), np.float32)},
     ),
-    Branch(_CHANGES, "peak of a change", {"motion.change.min_peak": 0.0}),
+    Branch(_CHANGES, "peak of a change", {"method.change:MIN_PEAK": 0.0}),
     Branch(_CHANGES, "changes of colour", {"method.change:_COLORS": np.zeros((2, 3))}),
     Branch(_CHANGES, "average over a window", {"method.change:_WINDOW": 1}),
     Branch(_CHANGES, "closing of outlines", {"method.change:_CLOSING": 1}),
@@ -204,7 +204,7 @@ BRANCHES: tuple[Branch, ...] = (
             )
         },
     ),
-    Branch(_ACTIVE, "hidden Gaussians", {"motion.active_set.min_weight": 0.0}),
+    Branch(_ACTIVE, "hidden Gaussians", {"method.active_set:_MIN_WEIGHT": 0.0}),
     Branch(_ACTIVE, "overlap", {"method.active_set:_MIN_OVERLAP": -1.0}),
     Branch(
         _ACTIVE,
@@ -225,7 +225,7 @@ BRANCHES: tuple[Branch, ...] = (
         "forward-backward check",
         {"method.flow:consistency_mask": lambda flow, *_: np.ones(flow.shape[:2], bool)},
     ),
-    Branch(_FLOW, "tolerance by length", {"motion.flow.consistency_relative": 0.0}),
+    Branch(_FLOW, "tolerance by length", {"method.flow:RELATIVE_TOLERANCE": 0.0}),
     Branch(_FLOW, "full resolution of small images", {"motion.flow.fine_width": 0}),
     # method.motion
     Branch(_STARTS, "lifted flow", {"motion.lift_flow": False}),
@@ -276,7 +276,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_CONFIDENCE, "two gates", {"motion.two_gates": False}),
     Branch(_CONFIDENCE, "gate of rotations", {"method.residual:BY_NAME": _FREE_ROTATION}),
     Branch(_CONFIDENCE, "confidence by lifted flow", {"motion.lift_confidence": False}),
-    Branch(_CONFIDENCE, "cohesion", {"motion.cohesion_weight": 0.0}),
+    Branch(_CONFIDENCE, "cohesion", {"method.cohesion:WEIGHT": 0.0}),
     Branch(_CONFIDENCE, "colour in cohesion", GONE),
     Branch(_CONFIDENCE, "far cohesion", {"method.cohesion:ROUNDS": 10}),
     Branch(_CONFIDENCE, "confidence of the frame before", GONE),
@@ -356,7 +356,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(
         _SHARED,
         "quiet as hardly responsible",
-        {"motion.active_set.min_responsibility": active_set.QUIET},
+        {"method.active_set:MIN_RESPONSIBILITY": active_set.QUIET},
     ),
     Branch(_SHARED, "covered pixels of colour", {"method.motion:_HALF_COLOR_PIXELS": 1.0}),
     Branch(_SHARED, "opacity of a birth", {"fit.density:_BIRTH_OPACITY": 0.3}),
@@ -367,8 +367,8 @@ BRANCHES: tuple[Branch, ...] = (
         _SHARES,
         "responsibility at most 1280 px wide",
         {
-            "method.active_set:responsibility": lambda gaussians, views, weight: _RESPONSIBILITY(
-                gaussians, views, weight, _ALL
+            "method.active_set:responsibility": lambda gaussians, views: _RESPONSIBILITY(
+                gaussians, views, _ALL
             )
         },
     ),

@@ -232,7 +232,7 @@ def _seen_views(
         # A view's first image has no changes; without `skip_static`, all pixels count as changed.
         change = np.full(image.shape[:2], not fit.skip_static)
         if before is not None and (fit.skip_static or exposures):
-            mask = change_mask(before.reference, image, view.mask, setup.config.motion.change)
+            mask = change_mask(before.reference, image, view.mask)
             # The reference is replaced where the image changed: a slow change is detected once it
             # has added up.
             old = before.reference.copy()

@@ -54,7 +54,6 @@ from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.core.view import View
 from morgs_mi.method.boxes import Boxes, boxes_around
-from morgs_mi.platform.config import Count, NonNegative, config_class
 from morgs_mi.render.active_view import ActiveView, ViewGroup
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.region import BlockGrid, Region, stacked
@@ -73,8 +72,17 @@ _MOST_CHANGED = 0.5
 _CORE = 0.6
 # Overlap above which a Gaussian is active: walls behind moving objects have less, what moves more.
 _MIN_OVERLAP = 0.35
-# Responsibility below which an active Gaussian is rendered in `quiet_views` only.
+# Responsibility above which a Gaussian is active: of noise and of neighbours that move, it is less.
+MIN_RESPONSIBILITY = 0.05
+# Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
+# hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
+# later.
+_MIN_WEIGHT = 0.2
+# Responsibility below which an active Gaussian hardly changes.
 QUIET = 0.2
+# Number of views in which such Gaussians are rendered: in all 27 of basketball, a tenth more pixels
+# would be drawn.
+QUIET_VIEWS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +141,7 @@ class _ReducedView:
 
 
 def responsibility(
-    gaussians: Gaussians, changed_views: ChangedViews, min_weight: float, width: int = 640
+    gaussians: Gaussians, changed_views: ChangedViews, width: int = 640
 ) -> np.ndarray:
     """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden
     ones.
@@ -141,8 +149,6 @@ def responsibility(
     Args:
         gaussians: N Gaussians of the previous frame, detached.
         changed_views: V views with the boxes of these Gaussians.
-        min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian
-            counts as hidden.
         width: views are reduced by the largest whole factor that leaves this width, in px.
     """
     render = changed_views.render
@@ -157,7 +163,7 @@ def responsibility(
     share = group.crop([view.share for view in changed])
     maps = np.stack([pixel_area * share, np.broadcast_to(pixel_area, share.shape)], axis=-1)
     change_weight, weight = group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
-    visible = weight > min_weight
+    visible = weight > _MIN_WEIGHT
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
     # view.
     boxes = changed_views.boxes
@@ -178,21 +184,6 @@ def overlap(changed_views: ChangedViews) -> np.ndarray:
     shares = boxes.total(near / dr.maximum(boxes.area, 1))
     counts = boxes.total(dr.select(boxes.area > 0, mi.Float(1), 0))
     return np.asarray(shares / dr.maximum(counts, 1))
-
-
-@config_class
-class ActiveSetConfig:
-    """Settings of the selection, see the module."""
-
-    min_responsibility: NonNegative = 0.05
-    """Responsibility above which a Gaussian is active."""
-    min_weight: NonNegative = 0.2
-    """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
-    hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
-    later."""
-    quiet_views: Count = 12
-    """Number of views in which active Gaussians that hardly change are rendered: in all 27 of
-    basketball, a tenth more pixels would be drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +273,6 @@ def find_active_set(
     gaussians: Gaussians,
     views: Mapping[int, ChangedView],
     render: RenderConfig,
-    config: ActiveSetConfig,
 ) -> ActiveSet:
     """Return the active set of a frame (see the module), without static splats.
 
@@ -290,7 +280,6 @@ def find_active_set(
         gaussians: N Gaussians of the previous frame, detached.
         views: V views with their changed pixels, by view index.
         render: cut-offs.
-        config: settings.
     """
     if not views:
         return ActiveSet(np.arange(0), len(gaussians), {}, 0)
@@ -298,15 +287,15 @@ def find_active_set(
     if sum(view.change.mean() for view in views.values()) > _MOST_CHANGED * len(views):
         return full_active_set(gaussians, cameras, render)
     changed_views = ChangedViews.of(gaussians, [*views.values()], render)
-    shares = responsibility(gaussians, changed_views, config.min_weight)
-    active = shares > config.min_responsibility
+    shares = responsibility(gaussians, changed_views)
+    active = shares > MIN_RESPONSIBILITY
     active &= overlap(changed_views) > _MIN_OVERLAP
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     active |= _inside_unexplained(changed_views, active)
     # Those that hardly change are drawn in some views only.
     drawn = np.tile(active & (shares > QUIET), (len(views), 1))
-    drawn[[*choose_key_views([*cameras.values()], config.quiet_views)]] = active
+    drawn[[*choose_key_views([*cameras.values()], QUIET_VIEWS)]] = active
     boxes = changed_views.boxes
     drawn_blocks = boxes.union(drawn) | (changed_views.counts > 0)
     active_views = {}

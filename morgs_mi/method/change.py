@@ -21,12 +21,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from morgs_mi.platform.config import NonNegative, config_class
-
 NORMAL = 1.4826
 """Standard deviations of normal noise in a median absolute deviation."""
 # Of 1; also the least threshold, and the bound of the noise of the whole image.
 _GREY_LEVEL = 1 / 255
+# Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4
+# million pixels.
+_SIGMAS = 5.0
+# Change that a connected change must exceed in one of its pixels, of 1: blocks of compressed video
+# change by less.
+MIN_PEAK = 4 * _GREY_LEVEL
 # px: 5 x 5 groups of pixels, that far apart, are a sample of the noise that thin moving parts do
 # not dominate.
 _NOISE_STEP = 4
@@ -41,24 +45,10 @@ _SUM = np.ones((1, 3), np.float32)
 _COLORS = _GREY_LEVEL * np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 
 
-@config_class
-class ChangeConfig:
-    """Settings of the change detection."""
-
-    sigmas: NonNegative = 5.0
-    """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4
-    million pixels.
-    """
-    min_peak: NonNegative = 4 * _GREY_LEVEL
-    """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0:
-    none. Blocks of compressed video change by less."""
-
-
 def change_mask(
     reference: np.ndarray,
     image: np.ndarray,
     valid: np.ndarray | None,
-    config: ChangeConfig,
 ) -> np.ndarray:
     """Return the mask of changed pixels [H, W], bool.
 
@@ -66,16 +56,15 @@ def change_mask(
         reference: an earlier image of the same camera, uint8 [H, W, 3].
         image: a later one, likewise.
         valid: [H, W] bool, pixels that count; None: all.
-        config: settings.
     """
     H, W = reference.shape[:2]
     difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)
     brightness = cv2.transform(difference, _SUM) * np.float32(_GREY_LEVEL / 3)
-    levels = _levels(brightness, 1, config)
+    levels = _levels(brightness, 1)
     half_size = (max(W // 2, 1), max(H // 2, 1))
     half = cv2.resize(difference, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
     for channel in cv2.split(cv2.transform(half, _COLORS)):
-        color_levels = _levels(channel, 2, config)
+        color_levels = _levels(channel, 2)
         pixel_levels = cv2.resize(color_levels, (W, H), interpolation=cv2.INTER_NEAREST)
         levels = np.maximum(levels, pixel_levels)
     levels = levels if valid is None else levels * valid
@@ -87,14 +76,13 @@ def change_mask(
     return has_peak[labels]
 
 
-def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
-    """Return 1 where a change [H, W], of 1, exceeds its noise on average, 2 where also `min_peak`,
+def _levels(change: np.ndarray, scale: int) -> np.ndarray:
+    """Return 1 where a change [H, W], of 1, exceeds its noise on average, 2 where also `MIN_PEAK`,
     else 0, uint8.
 
     Args:
         change: at 1 / scale of the resolution.
         scale: of the resolution.
-        config: settings.
     """
     window = _WINDOW // scale | 1
     # Zero padding: reflection would double the noise at the border.
@@ -102,10 +90,10 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     sample = average.ravel()[:: max(1, average.size // 20_000)]
     everywhere = min(NORMAL * float(np.median(np.abs(sample - np.median(sample)))), _GREY_LEVEL)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
-    threshold = np.maximum(config.sigmas * noise, _GREY_LEVEL).astype(np.float32)
+    threshold = np.maximum(_SIGMAS * noise, _GREY_LEVEL).astype(np.float32)
     size = np.abs(average)
     exceeds = size > cv2.resize(threshold, change.shape[::-1])
-    return exceeds.astype(np.uint8) + (exceeds & (size > config.min_peak))
+    return exceeds.astype(np.uint8) + (exceeds & (size > MIN_PEAK))
 
 
 def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:

@@ -26,6 +26,9 @@ from morgs_mi.core.gaussians import Gaussians
 
 # Number of nearest Gaussians: more of them would pull along thin objects of few Gaussians.
 _NEIGHBOURS = 12
+# lambda, the weight of an opaque neighbour against a Gaussian's own evidence: 12 of them outvote it
+# by far.
+WEIGHT = 50.0
 # Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads
 # farther.
 ROUNDS = 150
@@ -70,7 +73,6 @@ def share_confidence(
     indices: np.ndarray,
     logit: np.ndarray,
     still: float,
-    weight: float,
     neighbours: NeighbourIndex,
 ) -> np.ndarray:
     """Return the logits z [M] of the chosen Gaussians (see the module).
@@ -80,13 +82,12 @@ def share_confidence(
         indices: int [M], indices of the active ones.
         logit: u [M], their own logits.
         still: logit of all others.
-        weight: lambda, of an opaque neighbour; 0: no cohesion.
         neighbours: index of all means.
     """
     near = neighbours.nearest(_NEIGHBOURS, indices)
     if not near.size:
         return logit
-    affinity = np.float32(weight) * np.asarray(gaussians.opacities)[near]
+    affinity = np.float32(WEIGHT) * np.asarray(gaussians.opacities)[near]
     starts = np.arange(0, near.size + 1, near.shape[1])
     weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(indices), len(gaussians)))
     total = 1 + affinity.sum(axis=1)

@@ -19,8 +19,12 @@ from morgs_mi.method.flow_sources.flow_registry import (
 )
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 from morgs_mi.platform.checks import valid_pixels
-from morgs_mi.platform.config import config_or_default
 from morgs_mi.platform.threads import map_in_threads
+
+# Tolerated squared mismatch of the flows forth and back, as a share of their squared lengths, and
+# of the shortest flows, px^2 (Sundaram, Brox and Keutzer, ECCV 2010).
+RELATIVE_TOLERANCE = 0.01
+ABSOLUTE_TOLERANCE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +54,7 @@ def observe_key_views(
         pairs: images of the key views at two frames, by view index.
         method: source of the flow, see `FLOW_SOURCES`.
         mask_method: refinement of the masks, see `MASK_REFINERS`; None: no masks.
-        flow: settings of the flow and of its check.
+        flow: settings of the flow.
         masks: settings of the masks.
 
     Raises:
@@ -58,7 +62,7 @@ def observe_key_views(
         ValueError: a method is not registered, or as its factory.
     """
     source = FLOW_SOURCES.make(method, flow)
-    flows = map_in_threads(lambda pair: _checked_flow(source, pair, flow), pairs.values())
+    flows = map_in_threads(lambda pair: _checked_flow(source, pair), pairs.values())
     observations = dict(zip(pairs, flows, strict=True))
     if not mask_method:
         return observations
@@ -74,9 +78,7 @@ def observe_key_views(
     }
 
 
-def _checked_flow(
-    source: FlowSource, pair: FramePair, config: FlowConfig | None
-) -> FlowObservation:
+def _checked_flow(source: FlowSource, pair: FramePair) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
     box = pair.box or np.s_[:, :]
     flows = [flow[box] for flow in source(pair)]
@@ -88,7 +90,7 @@ def _checked_flow(
     images = []
     for flow, back in (flows, flows[::-1]):
         mask = valid & ~moves
-        mask[box] |= valid[box] & consistency_mask(flow, back, config)
+        mask[box] |= valid[box] & consistency_mask(flow, back)
         masks.append(mask)
         image = np.zeros((*shape, 2), np.float32)
         image[box] = np.where(moves[box][..., None], flow, 0)
@@ -97,9 +99,7 @@ def _checked_flow(
     return FlowObservation(-backward, masks[0], forward, masks[1])
 
 
-def consistency_mask(
-    flow: np.ndarray, back: np.ndarray, config: FlowConfig | None = None
-) -> np.ndarray:
+def consistency_mask(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Return the mask of reliable flow [H, W], bool: pixels that the flow back returns to where
     they started.
 
@@ -109,16 +109,14 @@ def consistency_mask(
     Args:
         flow: F [H, W, 2] in pixels, from one frame to another.
         back: B [H, W, 2], from the other frame to the first, on the other frame's grid.
-        config: the two tolerances; None: the defaults above.
     """
-    config = config_or_default("consistency_mask()", config, FlowConfig())
     height, width = flow.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x = x + flow[..., 0]
     y = y + flow[..., 1]
     back = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     lengths = _squares(flow) + _squares(back)
-    limit = config.consistency_relative * lengths + config.consistency_absolute
+    limit = RELATIVE_TOLERANCE * lengths + ABSOLUTE_TOLERANCE
     # An image ends half a pixel beyond the outermost centres, so the flow's own error does not
     # reject the border.
     is_within = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)

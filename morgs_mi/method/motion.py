@@ -215,7 +215,5 @@ def initial_motion(
     if gaussians is not previous:
         neighbours = NeighbourIndex(np.asarray(previous.means))
     logit = start.logit_confidence
-    shared = share_confidence(
-        previous, active.indices, logit, -LOGIT, config.cohesion_weight, neighbours
-    )
+    shared = share_confidence(previous, active.indices, logit, -LOGIT, neighbours)
     return replace(start, logit_confidence=shared)

@@ -6,13 +6,11 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from morgs_mi.method.active_set import ActiveSetConfig
-from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
-from morgs_mi.platform.config import Count, NonNegative, config_class
+from morgs_mi.platform.config import Count, config_class
 
 
 @config_class
@@ -60,9 +58,6 @@ class MotionConfig:
     """Number of cameras with optical flow and masks, or their names."""
     mask_interval: Count = 5
     """Frames from one supervision of the confidence by masks to the next."""
-    cohesion_weight: NonNegative = 50.0
-    """Weight of an opaque neighbour against the evidence of motion of a Gaussian alone (see
-    `cohesion`); 0: no cohesion."""
     model: str = "none"
     """Motion that Gaussians share, fitted before the residual: none, or a registered model (see
     docs/extending.md).
@@ -70,15 +65,11 @@ class MotionConfig:
     model_share: Annotated[float, Ge(0), Le(1)] = 0.5
     """Fraction of a later frame's epochs that fit this model, at least one epoch."""
     flow: FlowConfig = FlowConfig()
-    """Optical flow and its forward-backward check."""
+    """Optical flow."""
     masks: MaskConfig = MaskConfig()
     """Motion masks."""
     search: SearchConfig = SearchConfig()
     """Coarse search."""
-    active_set: ActiveSetConfig = ActiveSetConfig()
-    """Selection of the Gaussians that a frame may change."""
-    change: ChangeConfig = ChangeConfig()
-    """Detection of changed pixels."""
 
     def __post_init__(self) -> None:
         FLOW_SOURCES.check(self.flow_method)

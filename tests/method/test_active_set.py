@@ -13,7 +13,6 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.method.active_set import (
     ActiveSet,
-    ActiveSetConfig,
     ChangedView,
     find_active_set,
     full_active_set,
@@ -24,7 +23,7 @@ from tests.scenes.gaussians import isotropic, random_sheet
 from tests.scenes.views import observed
 
 RENDER = RenderConfig()
-CONFIG = ActiveSetConfig()
+PLACE = "morgs_mi.method.active_set"
 EXTENT = 3.0
 V = 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
@@ -72,15 +71,15 @@ def changes(previous, current):
     return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
-def found(gaussians, changed, config=CONFIG):
+def found(gaussians, changed):
     views = {v: ChangedView(camera, change=changed[v]) for v, camera in cameras().items()}
-    active = find_active_set(gaussians, views, RENDER, config)
+    active = find_active_set(gaussians, views, RENDER)
     return active.with_static(gaussians, ("color",))
 
 
-def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, current):
-    config = ActiveSetConfig(min_responsibility=0.1)  # half of one of the five views
-    active = found(previous, changes(previous, current), config)
+def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, current, monkeypatch):
+    monkeypatch.setattr(f"{PLACE}.MIN_RESPONSIBILITY", 0.1)  # half of one of the five views
+    active = found(previous, changes(previous, current))
     mask = np.isin(np.arange(len(previous)), active.indices)
     assert mask[HIDDEN:].mean() > 0.9  # the others are inside the ball
     assert mask[:HIDDEN].mean() < 0.15
@@ -110,11 +109,11 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(previous
     for change, drawn in zip(changes(wall, previous).values(), covered, strict=True):
         assert drawn[change].mean() > 0.9
     # With so few views, most of the wall behind is responsible all the same.
+    monkeypatch.setattr(f"{PLACE}.MIN_RESPONSIBILITY", 0.5)
     counts = []
     for min_explained in (0.0, 1.0):
-        monkeypatch.setattr("morgs_mi.method.active_set.EXPLAINED", min_explained)
-        config = ActiveSetConfig(min_responsibility=0.5)
-        active_set = found(wall, changes(wall, previous), config)
+        monkeypatch.setattr(f"{PLACE}.EXPLAINED", min_explained)
+        active_set = found(wall, changes(wall, previous))
         counts.append(len(active_set.indices))
     assert counts[0] < counts[1]
 
@@ -125,9 +124,9 @@ def test_find_active_set__draws_what_hardly_changed_in_some_views_only(
     changed = changes(previous, current)
 
     def drawn(quiet_views, quiet=0.9):
-        monkeypatch.setattr("morgs_mi.method.active_set.QUIET", quiet)
-        config = ActiveSetConfig(quiet_views=quiet_views)
-        active_set = found(previous, changed, config)
+        monkeypatch.setattr(f"{PLACE}.QUIET", quiet)
+        monkeypatch.setattr(f"{PLACE}.QUIET_VIEWS", quiet_views)
+        active_set = found(previous, changed)
         return active_set, {view: active_set.views[view].region.mask for view in range(V)}
 
     every, everywhere = drawn(V)

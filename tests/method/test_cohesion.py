@@ -5,11 +5,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
-from morgs_mi.method.motion_config import MotionConfig
 from tests.scenes.gaussians import isotropic, random_sheet
 
 STILL = -2.0
-WEIGHT = MotionConfig().cohesion_weight
 # The wall has 600 Gaussians, the object 100.
 WALL = np.arange(700) < 600
 
@@ -29,10 +27,10 @@ def moving(share, seed=1):
     return np.where(~WALL & (rng.random(700) < share), 2.0, STILL).astype(np.float32)
 
 
-def shared(gaussians, logit, weight=WEIGHT, indices=None):
+def shared(gaussians, logit, indices=None):
     indices = np.arange(len(gaussians)) if indices is None else indices
     neighbours = NeighbourIndex(np.asarray(gaussians.means))
-    return share_confidence(gaussians, indices, logit, STILL, weight, neighbours)
+    return share_confidence(gaussians, indices, logit, STILL, neighbours)
 
 
 def test_share_confidence__fills_gaps_in_an_object_apart_from_others():
@@ -59,9 +57,10 @@ def test_share_confidence__is_not_stopped_by_transparent_neighbours():
 
 def test_share_confidence__solves_its_equation(monkeypatch):
     gaussians = wall_and_object(0.3)
-    few = shared(gaussians, moving(0.5), 0.2)
+    monkeypatch.setattr("morgs_mi.method.cohesion.WEIGHT", 0.2)
+    few = shared(gaussians, moving(0.5))
     monkeypatch.setattr("morgs_mi.method.cohesion.ROUNDS", 151)
-    many = shared(gaussians, moving(0.5), 0.2)
+    many = shared(gaussians, moving(0.5))
     assert_allclose(few, many, atol=1e-5)
     means = np.asarray(gaussians.means)
     i = 650
@@ -79,10 +78,10 @@ def test_share_confidence__counts_all_but_the_chosen_as_still():
     assert (confidence < 0).all()
 
 
-def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
+def test_share_confidence__returns_the_logits_without_neighbours_or_weight(monkeypatch):
     one = isotropic(np.zeros((1, 3)), 0.1, 0.9)
     logit = np.array([1.5], np.float32)
     assert_array_equal(shared(one, logit), logit)
-    alone = shared(wall_and_object(0.0), moving(0.5), 0)
-    assert_array_equal(alone, moving(0.5))
     assert not len(shared(one, logit[:0], indices=np.arange(0)))
+    monkeypatch.setattr("morgs_mi.method.cohesion.WEIGHT", 0)
+    assert_array_equal(shared(wall_and_object(0.0), moving(0.5)), moving(0.5))

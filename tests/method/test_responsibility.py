@@ -33,7 +33,7 @@ def changed_views(gaussians, changes):
 
 
 def responsibility_for(gaussians, changes, width=640):
-    return responsibility(gaussians, changed_views(gaussians, changes), 0.2, width)
+    return responsibility(gaussians, changed_views(gaussians, changes), width)
 
 
 def exact_ratio(gaussians, changes):

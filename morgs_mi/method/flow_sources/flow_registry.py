@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from morgs_mi.method.method_registry import Registry
-from morgs_mi.platform.config import NonNegative, NonNegativeInt, config_class
+from morgs_mi.platform.config import NonNegativeInt, config_class
 
 NOISE_PX = 0.2
 """Noise of the flow where nothing moves, px, in images of any width."""
@@ -24,7 +24,7 @@ NOISE_PX = 0.2
 
 @config_class
 class FlowConfig:
-    """Settings of OpenCV's methods and of the forward-backward check.
+    """Settings of OpenCV's methods.
 
     Raises:
         ValueError: a number is out of range.
@@ -34,12 +34,6 @@ class FlowConfig:
     """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half
     resolution.
     """
-    consistency_relative: NonNegative = 0.01
-    """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both
-    flows.
-    """
-    consistency_absolute: NonNegative = 0.5
-    """Forward-backward check: tolerated squared mismatch of the shortest flows, px^2."""
 
 
 @dataclass(frozen=True, eq=False)

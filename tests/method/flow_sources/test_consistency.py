@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.method.flow import consistency_mask
-from morgs_mi.method.flow_sources.flow_registry import FlowConfig
 
 
 def constant_flow(x, y=0.0):
@@ -27,18 +26,20 @@ def test_consistency_mask__samples_the_flow_back_where_the_flow_leads():
 
 
 @pytest.mark.parametrize(
-    ("back", "config", "passes"),
+    ("back", "relative", "absolute", "passes"),
     [
-        # |F| = 6: by default a squared mismatch of 0.01 (36 + |B|^2) + 0.5 is tolerated.
-        (-7.0, FlowConfig(), True),
-        (-7.5, FlowConfig(), False),
-        (-7.0, FlowConfig(consistency_relative=0), False),
-        (-7.0, FlowConfig(consistency_absolute=0), False),
-        (-7.5, FlowConfig(consistency_relative=0.03), True),
-        (-7.5, FlowConfig(consistency_absolute=2), True),
+        # |F| = 6: a squared mismatch of 0.01 (36 + |B|^2) + 0.5 is tolerated.
+        (-7.0, 0.01, 0.5, True),
+        (-7.5, 0.01, 0.5, False),
+        (-7.0, 0, 0.5, False),
+        (-7.0, 0.01, 0, False),
+        (-7.5, 0.03, 0.5, True),
+        (-7.5, 0.01, 2, True),
     ],
 )
-def test_consistency_mask__tolerates_the_configured_mismatch(back, config, passes):
-    mask = consistency_mask(constant_flow(6), constant_flow(back), config)
+def test_consistency_mask__tolerates_a_mismatch(monkeypatch, back, relative, absolute, passes):
+    monkeypatch.setattr("morgs_mi.method.flow.RELATIVE_TOLERANCE", relative)
+    monkeypatch.setattr("morgs_mi.method.flow.ABSOLUTE_TOLERANCE", absolute)
+    mask = consistency_mask(constant_flow(6), constant_flow(back))
     assert mask[:, :20].all() == passes
     assert mask[:, :20].any() == passes
