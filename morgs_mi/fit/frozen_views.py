@@ -32,7 +32,7 @@ from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.residual import apply_residual
 from morgs_mi.method.ssim import Comparison
 from morgs_mi.method.ssim_layout import RUN, Lanes, Planes
-from morgs_mi.render.active_view import ActiveView, StaticSplats
+from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.backend import elements, sections
 from morgs_mi.render.padded_region import (
     Packing,
@@ -69,6 +69,7 @@ class LaterLosses:
     motion: MotionConfig  #: Gates of the residual.
     render: RenderConfig  #: Cut-offs.
     num_static: int  #: Static splats that it has room for.
+    static_size: int  #: Size of the arrays that have those of all views.
 
     def __call__(
         self,
@@ -255,6 +256,10 @@ class LaterSteps:
     ) -> None:
         statics = [view.static_splats for view in views.values() if view.static_splats is not None]
         self._num_static = room_for("static splats", max(map(len, statics), default=0))
+        splats_of_views = {id(static.together): static.together for static in statics}
+        most = max(map(len, splats_of_views.values()), default=0)
+        static_size = room_for("static splats of all views", most)
+        columns = {key: _columns(splats, static_size) for key, splats in splats_of_views.items()}
         self._objective = objective
         self._views: dict[int, StepView] = {}
         compared_views = {v: ComparedView.of(view) for v, view in views.items()}
@@ -271,15 +276,25 @@ class LaterSteps:
                 for name, image in images.items()
             }
             packing, arrays = rooms.arrays(compared_view)
-            static = view.static_splats or _no_static(channels)
-            arrays["static"] = _columns(static.together, channels)
-            arrays["static_range"] = from_numpy(mi.UInt32, [static.first, static.count])
+            static = view.static_splats
+            if static is None:
+                arrays["static"] = _no_static(channels, static_size)
+                arrays["static_range"] = from_numpy(mi.UInt32, [0, 0])
+            else:
+                arrays["static"] = _with_channels(columns[id(static.together)], channels)
+                arrays["static_range"] = from_numpy(mi.UInt32, [static.first, static.count])
             arrays["observed"] = {
                 name: from_numpy(mi.Float, filled(image.ravel(), int(np.prod(shapes[name]))))
                 for name, image in images.items()
             }
             losses = LaterLosses(
-                packing, tuple(shapes.items()), objective, motion, view.config, self._num_static
+                packing,
+                tuple(shapes.items()),
+                objective,
+                motion,
+                view.config,
+                self._num_static,
+                static_size,
             )
             terms = active_terms(observed, parameters, objective)
             names = (*(term.name for term in terms), SQUARED_ERROR)
@@ -377,31 +392,40 @@ def _row_shape(name: str, width: int) -> tuple[int, ...]:
     return (width // 3, 3) if name == "sh_coeffs" else BY_NAME[name].shape
 
 
-def _columns(splats: Splats, channels: Sequence[str]) -> dict[str, Any]:
-    """Return splats as the arguments of a recording that draws some channels."""
-    names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid")
-    arrays = {name: vars(splats)[name] for name in names}
-    return {**arrays, "channels": {name: splats.channels[name] for name in channels}}
+def _columns(splats: Splats, size: int) -> dict[str, Any]:
+    """Return splats as arguments of a recording, in arrays of a size: Dr.Jit infers the sizes of
+    launches from those of arrays, and would take other ones for others.
+    """
+    names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid", "channels")
+    lane = dr.arange(mi.UInt32, size)
+    is_splat = lane < opaque(mi.UInt32, len(splats))
+    columns = dr.gather(dict, {name: vars(splats)[name] for name in names}, lane, is_splat)
+    dr.eval(columns)
+    return columns
 
 
-def _no_static(channels: Sequence[str]) -> StaticSplats:
-    """Return no static splats, of arrays that are not empty."""
-    sizes = {"color": 3, "motion": 2, "guided_motion": 2}
+def _with_channels(columns: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return the arguments of a recording that draws some channels."""
+    return {**columns, "channels": {name: columns["channels"][name] for name in names}}
+
+
+def _no_static(channels: Sequence[str], size: int) -> dict[str, Any]:
+    """Return no static splats, in arrays of a size."""
+    widths = {"color": 3, "motion": 2, "guided_motion": 2}
 
     # Arrays of their own: a recording takes two that share memory for one.
     def zeros(count: int) -> list[Float]:
-        return [from_numpy(mi.Float, [0.0, 0.0]) for _ in range(count)]
+        return [from_numpy(mi.Float, np.zeros(size)) for _ in range(count)]
 
-    splats = Splats(
-        mean=mi.Point2f(zeros(2)),
-        conic=mi.Vector3f(zeros(3)),
-        log2_opacity=zeros(1)[0],
-        channels={name: tuple(zeros(sizes.get(name, 1))) for name in channels},
-        depth=zeros(1)[0],
-        radius=mi.Vector2f(zeros(2)),
-        valid=from_numpy(mi.Bool, [False, False]),
-    )
-    return StaticSplats(splats, 0, 0)
+    return {
+        "mean": mi.Point2f(zeros(2)),
+        "conic": mi.Vector3f(zeros(3)),
+        "log2_opacity": zeros(1)[0],
+        "depth": zeros(1)[0],
+        "radius": mi.Vector2f(zeros(2)),
+        "valid": from_numpy(mi.Bool, np.zeros(size, bool)),
+        "channels": {name: tuple(zeros(widths.get(name, 1))) for name in channels},
+    }
 
 
 def _comparison(region: PaddedRegion, words: Inputs, view: Inputs) -> Comparison:

@@ -250,6 +250,22 @@ def with_leaf(tree, path, value):
     return type(tree)(copy)
 
 
+def test_later_steps__have_arrays_of_the_sizes_that_their_settings_give(monkeypatch):
+    """Dr.Jit infers the sizes of launches from those of arrays: a recording whose 832 lanes were
+    eight times as many as the static splats had 432 lanes with 54 of them, and wrote elsewhere.
+    """
+    monkeypatch.setattr(frozen_step, "sizes_by_name", {})
+    sizes = {}
+    for static_count in (250, 240, 220):
+        frame = moving_ball(static_count)
+        optimizer = adam(residual_parameters(frame.gaussians, MOTION))
+        steps = LaterSteps(frame.views, optimizer, ObjectiveConfig(), MOTION)
+        for view in steps._views.values():
+            widths = [(path, dr.width(values)) for path, values in leaves(view.arrays)]
+            assert sizes.setdefault((view.losses, view.sizes), widths) == widths
+    assert len(sizes) == 3  # of four views, two have the same setting
+
+
 def recorded_arguments(view, is_scored):
     """Return the setting and the arguments of the second step of a view."""
     frame = moving_ball()
