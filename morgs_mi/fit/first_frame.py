@@ -20,7 +20,6 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drjit.opt import Adam
 
 from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.attributes import ATTRIBUTES
@@ -192,101 +191,136 @@ def fit_first_frame(
     """
     progress = progress or Progress()
     steps = config.planned_steps
-    start = problem.start
     # Steps before which a band is added; 3 times a thirtieth of 30 is 3, and not below.
-    bands = [int(band * steps * BAND + 1e-9) for band in range(1, start.sh_degree + 1)]
+    bands = [int(k * steps * BAND + 1e-9) for k in range(1, problem.start.sh_degree + 1)]
     rounds = density_rounds(config)
-    parameters = start.parameters()
-    names = [a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters]
-    # The higher bands follow.
-    optimizer = adam({name: parameters[name] for name in names if name != "sh_rest"})
-    rates = config.first_frame_rates.by_parameter(problem.extent)
-    views = _observed(half_sized(problem.views) if rounds else problem.views, problem.render)
-
-    def losses_at(parameters: Tensors, view: int) -> Tensors:
-        gaussians = dropped(start.with_parameters(parameters), config.dropout or 0.0, rng)
-        image = render_view(gaussians, views[view])
-        target = views[view].target
-        loss = recon_loss(image.color, target, config.objective.dssim_weight)
-        return {"recon": loss, SQUARED_ERROR: target.mse}
-
-    def record() -> FirstSteps | None:
-        """Return the steps in the views as recordings; None where they cannot be recorded."""
-        if not is_recordable(views, ObjectiveConfig()):
-            return None
-        weight = config.objective.dssim_weight
-        return FirstSteps(views, weight, config.dropout or 0.0, rng)
-
-    steps_of_views = record()
-    control = DensityControl(problem.cameras, config.density, problem.extent, rng)
-    losses = {}
-    order = iter(view_order(len(views), steps, rng))
+    fit = _GaussianFit(problem, config, rng)
+    fit.use(half_sized(problem.views) if rounds else problem.views)
+    order = iter(view_order(len(fit.views), steps, rng))
     pace = _Pace(steps, limit, _LATE if rounds else 1.0)
-
+    losses = {}
     for first, stop in pairwise(sorted({0, *bands, *rounds, steps})):
         if on_round is not None and first in rounds:
-            on_round(start.with_parameters(values_of(optimizer)))
+            on_round(fit.gaussians())
         for _ in range(bands.count(first)):
-            _add_band(optimizer, start)
+            fit.add_band()
         if first in rounds:
             if first == rounds[-1]:  # its scores come from the full images already
-                views = _observed(problem.views, problem.render)
-                steps_of_views = record()
-            gaussians = start.with_parameters(values_of(optimizer))
-            missing = max(config.planned_gaussians - len(gaussians), 0)
-            control.observe_views(gaussians, views)
-            del gaussians  # tensors that the next steps would keep in memory
-            births = -(-missing // (len(rounds) - rounds.index(first)))
-            start = start.select(control.step(optimizer, births).parent)
-        chunk = Steps(
-            pace.views(order, stop),
-            rate_factor=lambda _: FINAL_RATE ** (pace.position / steps),
-            on_step=lambda _: progress(*pace.done()),
-            averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(views)),
+                fit.use(problem.views)
+            fit.density_round(len(rounds) - rounds.index(first))
+        losses = fit.make(
+            Steps(
+                pace.views(order, stop),
+                rate_factor=lambda _: FINAL_RATE ** (pace.position / steps),
+                on_step=lambda _: progress(*pace.done()),
+                averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(fit.views)),
+            )
         )
-        recorded_steps = steps_of_views.of(len(start)) if steps_of_views is not None else None
-        losses = optimise(optimizer, rates, losses_at, chunk, recorded_steps=recorded_steps)
     if pace.count < steps:  # perhaps the last ones were skipped
         total = pace.done()[1]
         progress(total, total)
     psnr = pop_psnr(losses)
-    problem_text = fit_problem(psnr, (view.target.constant_error() for view in views))
-    gaussians = start.with_parameters(values_of(optimizer))
-    return FirstFrame(gaussians, losses, pace.count, psnr, problem_text)
+    problem_text = fit_problem(psnr, (view.target.constant_error() for view in fit.views))
+    return FirstFrame(fit.gaussians(), losses, pace.count, psnr, problem_text)
 
 
-def _observed(views: Sequence[View], render: RenderConfig) -> list[ObservedView]:
-    """Return whole views as they are rendered and compared."""
-    return [
-        ObservedView.of(ActiveView(view.camera, render), Target(view.image, view.mask))
-        for view in views
-    ]
+class _GaussianFit:
+    """Fit of the Gaussians of the first frame, in parts; `use` comes first.
+
+    Args:
+        problem: initial Gaussians, cameras, and cut-offs.
+        config: number of the Gaussians, rates, loss, dropout and density control.
+        rng: draws the Gaussians that steps leave out and the means of births.
+
+    Attributes:
+        views: the views that are rendered.
+    """
+
+    views: list[ObservedView]
+    _steps: FirstSteps | None  # in these views as recordings; None: they cannot be recorded
+
+    def __init__(
+        self, problem: FirstFrameProblem, config: FitConfig, rng: np.random.Generator
+    ) -> None:
+        self._config = config
+        self._render = problem.render
+        self._rng = rng
+        # The Gaussians with the values from which the parameters start.
+        self._start = problem.start
+        parameters = self._start.parameters()
+        names = [a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters]
+        # The higher bands follow.
+        self._optimizer = adam({name: parameters[name] for name in names if name != "sh_rest"})
+        self._rates = config.first_frame_rates.by_parameter(problem.extent)
+        self._control = DensityControl(problem.cameras, config.density, problem.extent, rng)
+
+    def use(self, views: Sequence[View]) -> None:
+        """Render and compare some views from now on."""
+        self.views = [
+            ObservedView.of(ActiveView(view.camera, self._render), Target(view.image, view.mask))
+            for view in views
+        ]
+        self._steps = None
+        if is_recordable(self.views, ObjectiveConfig()):
+            weight = self._config.objective.dssim_weight
+            self._steps = FirstSteps(self.views, weight, self._config.dropout or 0.0, self._rng)
+
+    def gaussians(self) -> Gaussians:
+        """Return the Gaussians."""
+        return self._start.with_parameters(values_of(self._optimizer))
+
+    def make(self, steps: Steps) -> dict[str, float]:
+        """Make some steps, and return their mean losses by name."""
+        recorded_steps = None if self._steps is None else self._steps.of(len(self._start))
+        return optimise(
+            self._optimizer, self._rates, self._losses_at, steps, recorded_steps=recorded_steps
+        )
+
+    def _losses_at(self, parameters: Tensors, index: int) -> Tensors:
+        """Render one view and return its losses by name."""
+        config = self._config
+        view = self.views[index]
+        gaussians = self._start.with_parameters(parameters)
+        image = render_view(dropped(gaussians, config.dropout or 0.0, self._rng), view)
+        loss = recon_loss(image.color, view.target, config.objective.dssim_weight)
+        return {"recon": loss, SQUARED_ERROR: view.target.mse}
+
+    def density_round(self, rounds: int) -> None:
+        """Prune, clone and split Gaussians where the errors of the views are largest.
+
+        Args:
+            rounds: number of this round and those that follow, which share the missing Gaussians.
+        """
+        gaussians = self.gaussians()
+        missing = max(self._config.planned_gaussians - len(gaussians), 0)
+        self._control.observe_views(gaussians, self.views)
+        del gaussians  # tensors that the next steps would keep in memory
+        plan = self._control.step(self._optimizer, -(-missing // rounds))
+        self._start = self._start.select(plan.parent)
+
+    def add_band(self) -> None:
+        """Add the next SH band to the parameters, with its values in the initial Gaussians."""
+        rest = np.asarray(self._start.sh_coeffs)[:, 1:]
+        if "sh_rest" not in self._optimizer:
+            self._optimizer["sh_rest"] = from_numpy(mi.TensorXf, rest[:, :3])
+            return
+        coefficients = np.asarray(dr.detach(self._optimizer["sh_rest"]))
+        count = coefficients.shape[1]
+        next_degree = round((count + 1) ** 0.5)
+        width = (next_degree + 1) ** 2 - 1
+        band = rest[:, count:width]
+        replace_parameter(
+            self._optimizer,
+            "sh_rest",
+            from_numpy(mi.TensorXf, np.concatenate([coefficients, band], axis=1)),
+            lambda m: from_numpy(mi.TensorXf, np.pad(m, [(0, 0), (0, width - count), (0, 0)])),
+        )
 
 
 def density_rounds(config: FitConfig) -> list[int]:
     """Return the steps of the first frame before which density control acts."""
     steps = np.linspace(_FIRST_ROUND, LAST_ROUND, config.density.rounds) * config.planned_steps
     return sorted(set(steps.astype(int).tolist()))
-
-
-def _add_band(optimizer: Adam, base: Gaussians) -> None:
-    """Add the next SH band to the parameters, with its values in `base`."""
-    rest = np.asarray(base.sh_coeffs)[:, 1:]
-    if "sh_rest" not in optimizer:
-        optimizer["sh_rest"] = from_numpy(mi.TensorXf, rest[:, :3])
-        return
-    coefficients = np.asarray(dr.detach(optimizer["sh_rest"]))
-    next_degree = round((coefficients.shape[1] + 1) ** 0.5)
-    width = (next_degree + 1) ** 2 - 1
-    new_coefficients = rest[:, coefficients.shape[1] : width]
-    replace_parameter(
-        optimizer,
-        "sh_rest",
-        from_numpy(mi.TensorXf, np.concatenate([coefficients, new_coefficients], axis=1)),
-        lambda m: from_numpy(
-            mi.TensorXf, np.pad(m, [(0, 0), (0, new_coefficients.shape[1]), (0, 0)])
-        ),
-    )
 
 
 def fit_confidence(

@@ -201,8 +201,10 @@ def initial_motion(
     gaussians = active.select(previous)
     start = MotionStart.without_motion(gaussians)
     if not (config.learn_motion and config.lift_flow):
-        if not config.constant_velocity or gaussians.motion is None:
-            return start if config.constant_velocity else None
+        if not config.constant_velocity:
+            return None
+        if gaussians.motion is None:
+            return start
         return replace(start, displacement=np.asarray(gaussians.motion))
     key_views = {v: views[v] for v in sorted(views) if views[v].flow is not None}
     problem = MotionProblem(gaussians, key_views, rng)
