@@ -157,7 +157,7 @@ def _fit_later_frame(
     active = find_active_set(previous, seen_views, config.render)
     # The optical flow, which is computed beside that.
     key_views = observation.key_views
-    observations = observe(key_views, motion, objective)
+    observations = {v: observe(view, motion, objective) for v, view in key_views.items()}
     observed = {}
     for view_observations in observations.values():
         observed |= view_observations

@@ -325,7 +325,7 @@ def density_rounds(config: FitConfig) -> list[int]:
 
 def fit_confidence(
     gaussians: Gaussians,
-    cameras: Mapping[int, Camera],
+    cameras: Sequence[Camera],
     masks: Mapping[int, np.ndarray],
     config: FitConfig,
     render: RenderConfig,
@@ -336,7 +336,7 @@ def fit_confidence(
 
     Args:
         gaussians: N Gaussians with a confidence.
-        cameras: by view index.
+        cameras: of all views.
         masks: motion masks [H, W], by view index.
         config: steps and rates.
         render: cut-offs.

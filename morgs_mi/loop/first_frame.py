@@ -329,6 +329,4 @@ def with_first_confidence(
         )
         for v, view in key_views.items()
     }
-    return fit_confidence(
-        gaussians, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng
-    )[0]
+    return fit_confidence(gaussians, setup.cameras, masks, config.fit, config.render, rng)[0]

@@ -81,22 +81,23 @@ def observe_key_views(
 def _checked_flow(source: FlowSource, pair: FramePair) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
     box = pair.box or np.s_[:, :]
-    flows = [flow[box] for flow in source(pair)]
     shape = pair.image.shape[:2]
     valid = valid_pixels(pair.valid, shape)
     # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
     moves = np.ones(shape, bool) if pair.region is None else pair.region
-    masks = []
-    images = []
-    for flow, back in (flows, flows[::-1]):
-        mask = valid & ~moves
-        mask[box] |= valid[box] & consistency_mask(flow, back)
-        masks.append(mask)
+
+    def checked(flow: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a flow of the box in the whole image, and where it is reliable."""
+        reliable = valid & ~moves
+        reliable[box] |= valid[box] & consistency_mask(flow, back)
         image = np.zeros((*shape, 2), np.float32)
         image[box] = np.where(moves[box][..., None], flow, 0)
-        images.append(image)
-    backward, forward = images
-    return FlowObservation(-backward, masks[0], forward, masks[1])
+        return image, reliable
+
+    to_previous, to_next = (flow[box] for flow in source(pair))
+    backward, reliable = checked(to_previous, to_next)
+    forward, forward_reliable = checked(to_next, to_previous)
+    return FlowObservation(-backward, reliable, forward, forward_reliable)
 
 
 def consistency_mask(flow: np.ndarray, back: np.ndarray) -> np.ndarray:

@@ -284,19 +284,13 @@ def terms_of(config: ObjectiveConfig) -> tuple[Term, ...]:
     return (*TERMS, *(LOSS_TERMS.make(text, config) for text in config.terms))
 
 
-def observe(
-    views: Mapping[int, KeyView], motion: MotionConfig, config: ObjectiveConfig
-) -> dict[int, Arrays]:
-    """Return the observations of the key views, arrays [H, W, ...] by name, by view index."""
-    observers = [term.observer for term in terms_of(config) if term.observer]
-    return {
-        index: {
-            name: array
-            for observer in observers
-            for name, array in observer(view, motion, config).items()
-        }
-        for index, view in views.items()
-    }
+def observe(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> Arrays:
+    """Return the observations of a key view, arrays [H, W, ...] by name."""
+    observations = {}
+    for term in terms_of(config):
+        if term.observer is not None:
+            observations |= term.observer(view, motion, config)
+    return observations
 
 
 def active_terms(

@@ -9,7 +9,7 @@ an image: derivatives of windows there are 0, and are read.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,8 @@ RADIUS = 5
 STRIP = 8  # pixels wide: a window extends at most into the next strip
 COLUMN = 16  # strips
 _SPARE = 2  # strips on either side
+# Weights of the rows of Sobel's filter, whose differences are of two pixels.
+_SOBEL = (0.125, 0.25, 0.125)
 # Rows of a run: enough that the 10 rows before it cost little, few enough to occupy every thread.
 _LONGEST = 64
 
@@ -151,21 +153,11 @@ class Planes:
         by Sobel's filter.
         """
         component, x, y = self._pixels_of(region)
-        xs, ys = (
-            [
-                dr.minimum(dr.maximum(mi.Int32(v) + step, 0), opaque(mi.Int32, size - 1))
-                for step in (-1, 0, 1)
-            ]
-            for v, size in ((x, self.width), (y, self.height))
-        )
-        near = [
-            [elements(planes, self._place(component, mi.UInt32(b), mi.UInt32(a))) for a in xs]
-            for b in ys
-        ]
-        along_x, along_y = (
-            sum(w * (rows[k][2] - rows[k][0]) for k, w in enumerate((0.125, 0.25, 0.125)))
-            for rows in (near, [*zip(*near, strict=True)])
-        )
+        xs = _neighbours(x, self.width)
+        ys = _neighbours(y, self.height)
+        rows = [[elements(planes, self._place(component, b, a)) for a in xs] for b in ys]
+        along_x = _slope(rows)
+        along_y = _slope([*zip(*rows, strict=True)])
         dr.eval(along_x, along_y)
         return along_x, along_y
 
@@ -260,6 +252,19 @@ class Planes:
         dr.while_loop((lanes.first,), lambda row: row < lanes.end, step, label="copied rows")
         dr.eval(target)  # before anything else is written to it
         return target
+
+
+def _neighbours(place: UInt32, size: int) -> list[UInt32]:
+    """Return the places before, at and after a place along an axis, inside the image."""
+    last = opaque(mi.Int32, size - 1)
+    return [
+        mi.UInt32(dr.minimum(dr.maximum(mi.Int32(place) + step, 0), last)) for step in (-1, 0, 1)
+    ]
+
+
+def _slope(rows: Sequence[Sequence[Float]]) -> Float:
+    """Return the mean slope along three rows of three numbers, per px."""
+    return sum(weight * (row[2] - row[0]) for weight, row in zip(_SOBEL, rows, strict=True))
 
 
 def _within(cells: np.ndarray, reach: int) -> np.ndarray:

@@ -291,9 +291,8 @@ def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images)
 def learned(steps, masks):
     """Return the opaque ball with a confidence that follows masks, by view."""
     config = dataclasses.replace(CONFIG, confidence_steps=steps)
-    cameras = {view: views()[view] for view in masks}
     start = dataclasses.replace(opaque_ball(), logit_confidence=np.zeros(400))
-    return fit_confidence(start, cameras, masks, config, RenderConfig(), np.random.default_rng(0))
+    return fit_confidence(start, views(), masks, config, RenderConfig(), np.random.default_rng(0))
 
 
 def halves():

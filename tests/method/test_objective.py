@@ -51,7 +51,7 @@ def key_view(mask):
     ],
 )
 def test_observe__follows_the_modules(motion, mask, expected):
-    assert observe({3: key_view(mask)}, motion, ObjectiveConfig())[3].keys() == expected
+    assert observe(key_view(mask), motion, ObjectiveConfig()).keys() == expected
 
 
 def test_channels_of__are_those_of_the_terms_that_act():
@@ -125,7 +125,7 @@ def test_loss_term__acts_where_its_observation_exists(registry):
         return dr.sum(observations["height"] - prediction.image.depth[..., 0], axis=None)
 
     config = ObjectiveConfig(terms=("height:2.5",))
-    (observations,) = observe({0: key_view(mask=False)}, MotionConfig(), config).values()
+    observations = observe(key_view(mask=False), MotionConfig(), config)
     assert observations.keys() == {"motion", "reliable", "height"}
     assert channels_of(observations, config) == ("color", "guided_motion", "depth")
     assert channels_of(observations, ObjectiveConfig()) == ("color", "guided_motion")
