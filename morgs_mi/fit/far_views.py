@@ -92,9 +92,8 @@ class _Plane:
 class _Rig:
     """Views that look at one place, reduced."""
 
+    #: With blurred images [H, W, 3], encoded, NaN in pixels that are not used.
     views: tuple[View, ...]
-    #: Blurred images [H, W, 3], encoded, NaN in pixels that are not used.
-    colors: tuple[np.ndarray, ...]
     focus: np.ndarray  #: Point [3] that all cameras look at.
     distance: float  #: Mean distance of the cameras from it.
 
@@ -103,22 +102,16 @@ class _Rig:
         cameras = [view.camera for view in views]
         focus = focus_point(cameras)
         distance = float(np.linalg.norm(positions_of(cameras) - focus, axis=1).mean())
-        reduced = tuple(map(_reduced, views))
-        colors = []
-        for view in reduced:
-            color = cv2.GaussianBlur(unit_values(view.image, np.float32), (0, 0), _BLUR)
-            color[~valid_pixels(view.mask, color.shape)] = np.nan
-            colors.append(color)
-        return cls(reduced, tuple(colors), focus, distance)
+        return cls(tuple(map(_blurred, views)), focus, distance)
 
     def shown(self, points: np.ndarray) -> np.ndarray:
         """Return the colours [V, P, 3] in which the views show points [P, 3], NaN where they do
         not.
         """
         result = np.full((len(self.views), len(points), 3), np.nan, np.float32)
-        for view, image, colors in zip(self.views, self.colors, result, strict=True):
+        for view, colors in zip(self.views, result, strict=True):
             visible, pixels = seen_pixels(view.camera, points)
-            colors[visible] = image[pixels]
+            colors[visible] = view.image[pixels]
         return result
 
     def is_near(self, points: np.ndarray, radius: float) -> np.ndarray:
@@ -128,10 +121,14 @@ class _Rig:
         return np.linalg.norm(points - self.focus, axis=1) < radius * self.distance
 
 
-def _reduced(view: View) -> View:
-    """Return a view reduced in width, or as it is if that leaves no valid pixel."""
+def _blurred(view: View) -> View:
+    """Return a view reduced in width, unless that leaves no valid pixel, with a blurred image."""
     reduced = view.reduced(_WIDTH)
-    return reduced if valid_pixels(reduced.mask, reduced.image.shape).any() else view
+    if valid_pixels(reduced.mask, reduced.image.shape).any():
+        view = reduced
+    image = cv2.GaussianBlur(unit_values(view.image, np.float32), (0, 0), _BLUR)
+    image[~valid_pixels(view.mask, image.shape)] = np.nan
+    return view.at(image)
 
 
 def are_around(cameras: Sequence[Camera]) -> bool:
@@ -161,6 +158,11 @@ def far_points(views: Sequence[View], count: int, rng: np.random.Generator) -> P
         is_behind = ~rig.is_near(points, _FLOOR)
         points[is_behind] = _on_backdrop(rig, view.camera, pixels[is_behind])
         parts.append((points, colors))
+    return concatenated_points(parts)
+
+
+def concatenated_points(parts: Sequence[Points]) -> Points:
+    """Return points one after the other."""
     positions, colors = zip(*parts, strict=True)
     return np.concatenate(positions), np.concatenate(colors)
 
@@ -173,11 +175,11 @@ def _floor(rig: _Rig, rng: np.random.Generator) -> _Plane:
     east = unit_vectors(np.cross(up, np.eye(3)[np.abs(up).argmin()]))
     north = np.cross(up, east)
     samples = []
-    for view, image in zip(rig.views, rig.colors, strict=True):
-        rows, columns = np.nonzero(np.isfinite(image[..., 0]))
+    for view in rig.views:
+        rows, columns = np.nonzero(np.isfinite(view.image[..., 0]))
         chosen = rng.permutation(len(rows))[:_SAMPLES]
         pixels = np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5
-        samples.append((view.camera, pixels, image[rows[chosen], columns[chosen]]))
+        samples.append((view.camera, pixels, view.image[rows[chosen], columns[chosen]]))
 
     some = np.concatenate([colors for _, _, colors in samples])[:: len(samples)]
     by_chance = [_alike(colors[:, None], some).mean(axis=1) for _, _, colors in samples]
@@ -216,17 +218,17 @@ def _objects(rig: _Rig, floor: _Plane, count: int, rng: np.random.Generator) -> 
     colours.
     """
     hidden = []
-    for view, image in enumerate(rig.colors):
-        height, width = image.shape[:2]
+    for index, view in enumerate(rig.views):
+        height, width = view.image.shape[:2]
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
-        points = floor.hits(rig.views[view].camera, pixels)
+        points = floor.hits(view.camera, pixels)
         points[~rig.is_near(points, _FLOOR)] = np.nan
-        difference = np.abs(rig.shown(points) - image.reshape(-1, 3)).max(axis=2)
-        difference[view] = np.inf
+        difference = np.abs(rig.shown(points) - view.image.reshape(-1, 3)).max(axis=2)
+        difference[index] = np.inf
         is_floor = (difference < _SAME).any(axis=0)
-        hidden.append(np.where(is_floor.reshape(height, width, 1), np.nan, image))
-    above = replace(rig, colors=tuple(hidden))
+        hidden.append(view.at(np.where(is_floor.reshape(height, width, 1), np.nan, view.image)))
+    above = replace(rig, views=tuple(hidden))
     ball = rng.normal(size=(_CANDIDATES, 3))
     ball = unit_vectors(ball) * rng.uniform(0, 1, (_CANDIDATES, 1)) ** (1 / 3)
     points = rig.focus + _OBJECTS * rig.distance * ball
@@ -238,8 +240,8 @@ def _objects(rig: _Rig, floor: _Plane, count: int, rng: np.random.Generator) -> 
     points = points[chosen]
     colors = colors[chosen]
     chance = np.ones(len(points))
-    for image in rig.colors:
-        some = rng.permutation(image[np.isfinite(image[..., 0])])[:_PIXELS]
+    for view in rig.views:
+        some = rng.permutation(view.image[np.isfinite(view.image[..., 0])])[:_PIXELS]
         alike = np.abs(colors[:, None] - some).max(axis=2) < _SAME
         chance *= alike.sum(axis=1) / max(len(some), 1)
     is_object = chance < _CHANCE

@@ -262,10 +262,8 @@ class RecordedSteps:
             moments: Jit = (t + steps, arrays[1], arrays[2], None)
             optimizer.state[name] = (parameter, promoted, rate, moments)
         dr.eval()
-        rows = (dict(zip(self._names, row.tolist(), strict=False)) for row in report)
-        return [
-            {name: row[name] for name in view.names} for view, row in zip(views, rows, strict=True)
-        ]
+        losses = {name: report[:, k].tolist() for k, name in enumerate(self._names)}
+        return [{name: losses[name][k] for name in view.names} for k, view in enumerate(views)]
 
     def _start(self, optimizer: Adam) -> dict[str, Jit]:
         """Return the state of the optimiser, padded."""

@@ -19,7 +19,7 @@ from morgs_mi.core.color_space import SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, in_image, scene_depths, scene_extent, seen_points
 from morgs_mi.core.view import View
-from morgs_mi.fit.far_views import Points, are_around, far_points
+from morgs_mi.fit.far_views import Points, are_around, concatenated_points, far_points
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import SAME_POINT, random_pixels, seen_pixels
 from morgs_mi.platform.checks import valid_pixels
@@ -118,7 +118,7 @@ def initial_points(
     num_points = len(points[0])
     cameras = [view.camera for view in views]
     if num_points < MANY_POINTS and are_around(cameras) and _fills(views, background):
-        points = _concatenated([points, far_points(views, max(count - num_points, 1), rng)])
+        points = concatenated_points([points, far_points(views, max(count - num_points, 1), rng)])
     elif num_points < MIN_POINTS:
         points = seed_points(views, count, rng, background)
     elif num_points < MANY_POINTS:
@@ -255,7 +255,7 @@ def seed_points(
         counts = _agreeing_views(points, np.tile(colors, (_DEPTHS, 1)), blurred)
         best = counts.reshape(depths.shape).argmax(axis=0)
         parts.append((points.reshape(*depths.shape, 3)[best, np.arange(len(share))], colors))
-    return _concatenated(parts)
+    return concatenated_points(parts)
 
 
 def _agreeing_views(points: np.ndarray, colors: np.ndarray, views: Sequence[View]) -> np.ndarray:
@@ -321,11 +321,6 @@ def mean_color(views: Sequence[View]) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _concatenated(parts: Sequence[Points]) -> Points:
-    positions, colors = zip(*parts, strict=True)
-    return np.concatenate(positions), np.concatenate(colors)
-
-
 def fill_points(
     points: Points, views: Sequence[View], count: int, rng: np.random.Generator
 ) -> Points:
@@ -369,7 +364,7 @@ def fill_points(
         colors = unit_values(view.image[rows[chosen], columns[chosen]])
         parts.append((view.camera.unproject(pixels, depth), colors))
     num_new = sum(len(positions) for positions, _ in parts)
-    return _concatenated([resample_points(points, count - num_new, rng), *parts])
+    return concatenated_points([resample_points(points, count - num_new, rng), *parts])
 
 
 @dataclass(frozen=True, eq=False)

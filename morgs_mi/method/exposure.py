@@ -122,16 +122,12 @@ def fit_exposure(
         good = good & r & g & b
     if good.sum() < _MIN_PIXELS:
         return prior
-    channels = zip(
-        scene[good].T.astype(float),
-        recorded[good].T.astype(float),
-        prior.gain,
-        prior.bias,
-        strict=True,
-    )
-    gains, biases = zip(*(_line(x, y, line, weights) for x, y, *line in channels), strict=True)
-    plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
-    return _exposure(np.array(gains), np.array(biases)) if plausible else prior
+    x = scene[good].astype(float)
+    y = recorded[good].astype(float)
+    lines = [_line(x[:, c], y[:, c], (prior.gain[c], prior.bias[c]), weights) for c in range(3)]
+    gain, bias = np.transpose(lines)
+    plausible = gain.min() > 0 and np.abs(np.log(gain)).max() < _MAX_LOG_GAIN
+    return _exposure(gain, bias) if plausible else prior
 
 
 def _line(

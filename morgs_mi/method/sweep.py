@@ -62,8 +62,9 @@ class KeyImages:
 
     def __init__(self, views: Mapping[int, ObservedView]) -> None:
         self.views = views
-        self._targets = [view.target for view in views.values()]
         self.group = ViewGroup([*views.values()])
+        targets = [view.target for view in views.values()]
+        self._targets = [*zip(targets, self.group.regions, strict=True)]
 
     def sums(self, gaussians: Gaussians, names: Sequence[str]) -> Arrays:
         """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one
@@ -126,8 +127,7 @@ class KeyImages:
     @cached_property
     def _pixels(self) -> tuple[Float, Float | None]:
         """The targets on the group, and the weights of their numbers; None: 1."""
-        pairs = zip(self._targets, self.group.regions, strict=True)
-        targets = [target.on(region) for target, region in pairs]
+        targets = [target.on(region) for target, region in self._targets]
         pixels = concatenated([numbers for numbers, _ in targets])
         if all(weight is None for _, weight in targets):
             return pixels, None
@@ -140,8 +140,9 @@ class KeyImages:
     @cached_property
     def _gradient(self) -> tuple[Float, Float]:
         """The derivatives of the targets along x and y, per px, flat on the group."""
-        pairs = zip(self._targets, self.group.regions, strict=True)
-        gradients = [target.planes.gradient_on(target.pixels, region) for target, region in pairs]
+        gradients = [
+            target.planes.gradient_on(target.pixels, region) for target, region in self._targets
+        ]
         x, y = zip(*gradients, strict=True)
         return concatenated(x), concatenated(y)
 
