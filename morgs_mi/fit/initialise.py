@@ -123,13 +123,9 @@ def initial_points(
         points = seed_points(views, count, rng, background)
     elif num_points < MANY_POINTS:
         points = fill_points(points, views, count, rng)
-    for is_resampled in (False, True):
-        points = resample_points(points, count, rng) if is_resampled else points
-        # Also afterwards: points between two others may lie there.
-        is_empty = in_empty_space(cameras, points[0])
-        if not is_empty.all():
-            points = points[0][~is_empty], points[1][~is_empty]
-    return points
+    points = resample_points(_outside_empty_space(points, cameras), count, rng)
+    # Again, because points between two others may lie there.
+    return _outside_empty_space(points, cameras)
 
 
 def has_points(cameras: Sequence[Camera], points: np.ndarray) -> bool:
@@ -173,6 +169,13 @@ def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
         pixels, _ = camera.project(np.asarray(means[near], np.float64))
         mask[near] |= in_image(camera, pixels)
     return mask
+
+
+def _outside_empty_space(points: Points, cameras: Sequence[Camera]) -> Points:
+    """Return the points that are not `in_empty_space`, or all if all are."""
+    positions, colors = points
+    is_empty = in_empty_space(cameras, positions)
+    return points if is_empty.all() else (positions[~is_empty], colors[~is_empty])
 
 
 def _in_light(points: Points, views: Sequence[View]) -> Points:

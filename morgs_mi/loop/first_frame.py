@@ -184,7 +184,8 @@ def fitted_first_frame(
     problem = FirstFrameProblem.of(views, cloud, plan, config.render, rng)
     fit_config = adapted_to_images(plan, problem)
 
-    if (count := len(setup.points)) < MIN_POINTS:
+    count = len(setup.points)
+    if count < MIN_POINTS:
         problems.append(
             f"too few points ({count}): seeded {plan.first_count} random ones inside the views"
         )
