@@ -72,6 +72,9 @@ class StepSetting:
     epsilon: float  #: Adam's.
     threads: int  #: Of Dr.Jit, which divide the adjoint (see `backend.sections`).
     sizes: PaddedSizes  #: Of the region.
+    #: Of the arrays of the view and of all views. Dr.Jit neither compares nor checks them: with
+    #: others, a recording writes outside of its arrays.
+    lengths: tuple[int, ...]
 
 
 def frozen_step(
@@ -172,6 +175,8 @@ class RecordedSteps:
         self.pending: list[tuple[int, Mapping[str, float]]] = []
         self._views = views
         self._shared = shared
+        of_shared = _lengths(shared)
+        self._lengths = {v: _lengths(view.arrays) + of_shared for v, view in views.items()}
         # Of all terms, also of those that act in other frames: a recording depends on the names.
         names = (name for view in views.values() for name in view.names)
         self._names = tuple(dict.fromkeys((*weights, *names)))
@@ -228,6 +233,7 @@ class RecordedSteps:
             optimizer.epsilon,
             dr.thread_count(),
             replace(sizes, capacity=self._capacity),
+            self._lengths[view],
         )
         if self._draw is not None:
             arrays = {**arrays, **self._draw.arrays(self._draw.rng)}
@@ -281,6 +287,13 @@ class RecordedSteps:
         state["report"] = dr.zeros(mi.Float, _MOST_STEPS * (len(self._names) + 1))
         dr.make_opaque(state)
         return state
+
+
+def _lengths(tree: Jit) -> tuple[int, ...]:
+    """Return the lengths of the arrays of a tree."""
+    if isinstance(tree, Mapping):
+        return tuple(length for branch in tree.values() for length in _lengths(branch))
+    return (dr.width(tree),)
 
 
 @lru_cache(maxsize=4096)
