@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 
@@ -38,20 +38,35 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 
 @dataclass(frozen=True)
-class CalibratedView:
-    """A camera of a capture folder, at the calibrated size, with its clip."""
+class CalibratedImage:
+    """One image of a calibration; those of one clip have the same pose and lens."""
 
-    camera: Camera  #: The camera.
-    lens: Lens  #: The lens that the clip was recorded through.
-    clip: Clip  #: A video, a folder of images or a list of images.
-    #: Images of the clip's size or scaled versions, whose black pixels are not used; no images: all
-    #: pixels are used.
+    camera: Camera  #: The camera, with the name of the image.
+    #: The lens that the image was recorded through.
+    lens: Lens = field(default_factory=Lens)
+    #: Images of its size or scaled versions, whose black pixels are not used; no images: all pixels
+    #: are used.
     masks: tuple[Path, ...] = ()
 
     @property
     def name(self) -> str:
-        """Name of the camera."""
+        """Name of the image."""
         return self.camera.name
+
+    @property
+    def pose(self) -> Hashable:
+        """The exact pose, intrinsics and lens, to compare with those of another image."""
+        camera = self.camera
+        return camera.world_to_camera.tobytes(), camera.K.tobytes(), camera.size, self.lens
+
+
+@dataclass(frozen=True)
+class CalibratedView(CalibratedImage):
+    """A camera of a capture folder, at the calibrated size, with its clip."""
+
+    clip: Clip = field(kw_only=True)  #: A video, a folder of images or a list of images.
+    #: The images of the clip that the calibration has.
+    images: tuple[CalibratedImage, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -74,6 +89,11 @@ class Calibration:
     def names(self) -> tuple[str, ...]:
         """Names of the cameras."""
         return tuple(view.name for view in self.views)
+
+    @property
+    def clips(self) -> dict[str, Clip]:
+        """The clips by the names of their cameras."""
+        return {view.name: view.clip for view in self.views}
 
     def centred(self, path: Path) -> Calibration:
         """Return the calibration relative to the `far_origin` of its cameras, with float32 points;
@@ -156,7 +176,7 @@ def only_calibration(
     path: Path,
     files: Sequence[Path],
     expected: str,
-    read: Callable[[Path], tuple[Sequence[Camera], Sequence[Lens]]],
+    read: Callable[[Path], Sequence[CalibratedImage]],
 ) -> Calibration:
     """Return what `read` reads from the only calibration of a capture; raises as `match_clips`.
 
@@ -168,8 +188,7 @@ def only_calibration(
         raise ValueError(
             f"{path}: expected {expected}, got {names}; keep the one of this recording."
         )
-    cameras, lenses = read(files[0])
-    return match_clips(path, files[0], required_clips(path), cameras, lenses)[0]
+    return match_clips(path, files[0], required_clips(path), read(files[0]))
 
 
 def required_clips(path: Path) -> Mapping[str, Clip]:
@@ -188,14 +207,9 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
 
 
 def match_clips(
-    path: Path,
-    source: Path,
-    clips: Mapping[str, Clip],
-    cameras: Sequence[Camera],
-    lenses: Sequence[Lens],
-) -> tuple[Calibration, tuple[tuple[int, ...], ...]]:
-    """Return the fixed cameras that have a clip, in numerical order of the clips' names, and the
-    indices of each one's images among `cameras`.
+    path: Path, source: Path, clips: Mapping[str, Clip], images: Sequence[CalibratedImage]
+) -> Calibration:
+    """Return the fixed cameras that have a clip, in numerical order of the clips' names.
 
     Cameras without a clip, and clips without a camera, are left out with a warning. Photos of equal
     pose and lens are the frames of one camera, which has the name of the first.
@@ -205,70 +219,56 @@ def match_clips(
             folders, are used if they match more cameras than `clips`.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
-        cameras: one or more per fixed camera, named as the calibration's images.
-        lenses: one per camera.
+        images: one or more per fixed camera.
 
     Raises:
         FileNotFoundError: no camera has a clip.
         ValueError: two images of one clip have different poses or lenses, a frame folder is
             missing, or the photos of several cameras have other numbers.
     """
-    # Tolerances of poses are relative to their coordinates.
-    local = moved(cameras, far_origin(cameras))
-    attempts = (
-        (lambda _: clips, True),
-        # Beside folders that could be clips, such as `depth`.
-        (photos, False),
-        (clips_by_frame, False),
-        (clips_by_rig, True),
-        (photos_by_rig, False),
-    )
-    matches = []
+    match = _Match({}, {}, [])
     errors = []
-    for find, by_folder in attempts:
+    # Photos and folders of frames may lie beside folders that could be clips, such as `depth`.
+    for find in (lambda _: clips, photos, clips_by_frame, clips_by_rig, photos_by_rig):
         try:
-            matches.append(_matched(source, find(path), local, lenses, by_folder))
+            other = _matched(source, find(path), images)
         except ValueError as error:
             errors.append(error)
             continue
-        if not matches[-1].without:
+        if len(other.images) > len(match.images):
+            match = other
+        if not other.without:
             break
-    # The match with the most cameras.
-    match = max(matches, key=lambda match: len(match.images), default=_NamedMatch({}, {}, []))
     if not match.images:
         if errors:
             raise errors[0]
         raise FileNotFoundError(
             f"{source}: expected clips named after its cameras "
-            f"{few([camera.name for camera in cameras])}, found {few([*clips])}; name the clips "
+            f"{few([image.name for image in images])}, found {few([*clips])}; name the clips "
             "after the cameras, one each: join the chapters of a video."
         )
-    clips = match.clips
-    if any(isinstance(clip, tuple) and len(clip) > 1 for clip in clips.values()):
-        check_frames(path, cast(Mapping[str, tuple[Path, ...]], clips))
+    first_clip = next(iter(match.clips.values()))
+    if isinstance(first_clip, tuple) and len(first_clip) > 1:
+        check_frames(path, first_clip)
     if match.without:
         _LOG.warning("%s: no clip is named after %s: left out.", source, few(match.without))
-    if extras := [name for name in clips if name not in match.images]:
+    if extras := [name for name in match.clips if name not in match.images]:
         _LOG.warning("%s does not calibrate %s: not used.", source, few(extras))
     unused = (*extras, *match.without)
-    poses = [
-        (camera.world_to_camera.tobytes(), camera.K.tobytes(), camera.size, lens)
-        for camera, lens in zip(cameras, lenses, strict=True)
-    ]
     masks = _masks(path, match.images)
-    match = _frames_of_cameras(source, match, poses)
-    names = sorted(match.images, key=natural_key)
-    images = tuple(tuple(match.images[name]) for name in names)
-    views = tuple(
-        CalibratedView(
-            replace(cameras[match.images[name][0]], name=name),
-            lenses[match.images[name][0]],
-            match.clips[name],
-            masks.get(name, ()),
+    match = _frames_of_cameras(source, match)
+    views = []
+    for name in sorted(match.images, key=natural_key):
+        first, *_ = images = tuple(match.images[name])
+        view = CalibratedView(
+            replace(first.camera, name=name),
+            first.lens,
+            tuple(sorted({*masks.get(name, ())}.union(*(image.masks for image in images)))),
+            clip=match.clips[name],
+            images=images,
         )
-        for name in names
-    )
-    return Calibration(views, unused=unused), images
+        views.append(view)
+    return Calibration(tuple(views), unused=unused)
 
 
 def _masks(path: Path, cameras: Collection[str]) -> dict[str | None, tuple[Path, ...]]:
@@ -289,78 +289,84 @@ def _masks(path: Path, cameras: Collection[str]) -> dict[str | None, tuple[Path,
 
 
 @dataclass(frozen=True)
-class _NamedMatch:
-    """Clips and the cameras that they belong to."""
+class _Match:
+    """Clips and the images that belong to them."""
 
     clips: Mapping[str, Clip]  # clips by name
-    # Indices of the cameras of each clip that has some, by the clip's name.
-    images: dict[str, list[int]]
-    without: list[str]  # names of the cameras that have no clip
+    images: dict[str, list[CalibratedImage]]  # of each clip that has some, by its name
+    without: list[str]  # names of the images that have no clip
 
 
-def _matched(
-    source: Path,
-    clips: Mapping[str, Clip],
-    cameras: Sequence[Camera],
-    lenses: Sequence[Lens],
-    by_folder: bool,
-) -> _NamedMatch:
-    """Return the match between clips and cameras, `by_folder` as for `view_of_image`.
+def _matched(source: Path, clips: Mapping[str, Clip], images: Sequence[CalibratedImage]) -> _Match:
+    """Return the match between clips and images.
 
     Raises:
         ValueError: two images of one clip have different poses or lenses.
     """
-    match = _NamedMatch(clips, {}, [])
-    for index, camera in enumerate(cameras):
-        name = camera.name
+    match = _Match(clips, {}, [])
+    # A clip in a folder, or a list of images in any folders, which have the cameras' names.
+    by_folder = any(isinstance(clip, Path) for clip in clips.values())
+    origin = far_origin([image.camera for image in images])
+    for image in images:
+        name = image.name
         if name not in clips:
             # The search for a word takes far longer than the one for names.
             name = view_of_image(clips, name, by_folder) or clip_of_camera(clips, name)
         if name is None:
-            match.without.append(camera.name)
+            match.without.append(image.name)
             continue
-        match.images.setdefault(name, []).append(index)
-        first = match.images[name][0]
-        same = (
-            np.allclose(cameras[first].viewmat, camera.viewmat, atol=1e-6)
-            and lenses[first] == lenses[index]
-        )
-        if not (same and np.allclose(cameras[first].K, camera.K)):
-            raise ValueError(
-                f"{source}: cameras must not move, but {cameras[first].name!r} and "
-                f"{camera.name!r}, both of {name}, have different poses or lenses; keep one image "
-                "of each fixed camera, and name the clips after them."
-            )
+        images_of_clip = match.images.setdefault(name, [image])
+        if images_of_clip[0] is not image:
+            _check_fixed(source, name, images_of_clip[0], image, origin)
+            images_of_clip.append(image)
     return match
 
 
-def _frames_of_cameras(source: Path, match: _NamedMatch, poses: Sequence[Hashable]) -> _NamedMatch:
+def _check_fixed(
+    source: Path, clip: str, first: CalibratedImage, other: CalibratedImage, origin: np.ndarray
+) -> None:
+    """Check that two images of a clip have the same pose, relative to `origin` [3], and lens."""
+    # Tolerances of poses are relative to their coordinates.
+    a, b = moved((first.camera, other.camera), origin)
+    if not (
+        np.allclose(a.viewmat, b.viewmat, atol=1e-6)
+        and np.allclose(a.K, b.K)
+        and first.lens == other.lens
+    ):
+        raise ValueError(
+            f"{source}: cameras must not move, but {first.name!r} and {other.name!r}, both of "
+            f"{clip}, have different poses or lenses; keep one image of each fixed camera, and "
+            "name the clips after them."
+        )
+
+
+def _frames_of_cameras(source: Path, match: _Match) -> _Match:
     """Return the match with one clip, named after the first, for all photos of equal pose and lens.
 
     Raises:
         ValueError: some have several photos, and the numbers of theirs differ or have gaps.
     """
-    frames: dict[Hashable, dict[str, Path]] = {}
+    photos_of: dict[Hashable, dict[str, Path]] = {}
     for name in sorted(match.images, key=natural_key):
         clip = match.clips[name]
         if isinstance(clip, Path) or len(clip) != 1:
             return match
-        frames.setdefault(poses[match.images[name][0]], {})[name] = clip[0]
-    if len(frames) == len(match.images):
+        photos_of.setdefault(match.images[name][0].pose, {})[name] = clip[0]
+    if len(photos_of) == len(match.images):
         return match
-    groups = [list(files) for files in frames.values()]
-    numbers = {tuple(frame_numbers(source, names)) for names in groups}
+    cameras = {next(iter(files)): files for files in photos_of.values()}
+    numbers = {tuple(frame_numbers(source, [*files])) for files in cameras.values()}
     steps = np.diff(min(numbers))
     require(
         len(numbers) == 1 and (steps == np.abs(steps[:1])).all(),
         source,
         "images of equal pose and lens are frames of one camera, and all cameras must have images "
         "of the same numbers without gaps",
-        few([f"{names[0]} to {names[-1]}" for names in groups], 4),
+        few([f"{name} to {list(files)[-1]}" for name, files in cameras.items()], 4),
         f"leave out images that repeat a pose, or make {EXAMPLE}",
     )
-    return _NamedMatch(
-        {next(iter(files)): tuple(files.values()) for files in frames.values()},
-        {names[0]: [match.images[name][0] for name in names] for names in groups},
+    return _Match(
+        {name: tuple(files.values()) for name, files in cameras.items()},
+        {name: [match.images[file][0] for file in files] for name, files in cameras.items()},
         [],
     )

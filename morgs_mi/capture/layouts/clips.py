@@ -161,13 +161,13 @@ def _in_order(files: Mapping[str, _Clip]) -> dict[str, _Clip]:
     return {name: files[name] for name in sorted(files, key=natural_key)}
 
 
-def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
-    """Check that the folders of `clips_by_frame` are numbered without gaps.
+def check_frames(path: Path, clip: Sequence[Path]) -> None:
+    """Check that the folders of a clip of `clips_by_frame` are numbered without gaps.
 
     Raises:
         ValueError: a number is missing or occurs twice.
     """
-    folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
+    folders = [f.relative_to(path).parts[0] for f in clip]
     check_numbering(path, frame_numbers(path, folders), folders)
 
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.layouts.calibration import (
     NO_POINTS,
+    CalibratedImage,
     Calibration,
     Reader,
     match_clips,
@@ -55,11 +56,14 @@ _CAMERA_BYTES = 500
 class ColmapModel:
     """A COLMAP model, before undistortion."""
 
-    #: One camera per image in the order of the file; `name` is the name of the image.
-    cameras: tuple[Camera, ...]
-    lenses: tuple[Lens, ...]  #: One lens per camera.
+    images: tuple[CalibratedImage, ...]  #: In the order of the file.
     points: np.ndarray  #: [P, 3], world units; P = 0 if there are none.
     point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras of the images."""
+        return tuple(image.camera for image in self.images)
 
 
 def find_models(folder: Path) -> list[Path]:
@@ -111,8 +115,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         with errors_at(f"{cameras_path}: camera {camera_id}"):
             intrinsics[camera_id] = (*lens_and_intrinsics(model, params), *size)
         check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
-    cameras: list[Camera] = []
-    lenses: list[Lens] = []
+    images: list[CalibratedImage] = []
     rows = binary_images(images_path) if is_binary else text_images(images_path)
     for name, camera_id, pose in rows:
         with errors_at(f"{images_path}, image {name!r}"):
@@ -126,10 +129,9 @@ def read_colmap(folder: str | Path) -> ColmapModel:
             viewmat = np.eye(4)
             viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
             viewmat[:3, 3] = pose[4:]
-            cameras.append(Camera(K, viewmat, width, height, name))
-            lenses.append(lens)
-        check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
-    if not cameras:
+            images.append(CalibratedImage(Camera(K, viewmat, width, height, name), lens))
+        check_claim(images_path, _CAMERA_BYTES * len(images), f"{len(images)} images")
+    if not images:
         raise ValueError(f"{images_path}: expected at least one image, got none; register them.")
     paths = (folder / f"points3D.{suffix}" for suffix in (kind, "bin", "txt", "ply"))
     path = next((path for path in paths if path.exists()), None)
@@ -142,7 +144,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         table = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
         points, colors = np.hsplit(table, 2)
         colors = (colors / 255).astype(np.float32)
-    return ColmapModel(tuple(cameras), tuple(lenses), points, colors)
+    return ColmapModel(tuple(images), points, colors)
 
 
 def write_colmap(
@@ -211,7 +213,7 @@ def _read_calibration(path: Path) -> Calibration:
             counts,
         )
     model = read_colmap(folder)
-    calibration, _ = match_clips(path, folder, clips, model.cameras, model.lenses)
+    calibration = match_clips(path, folder, clips, model.images)
     return replace(calibration, points=model.points, point_colors=model.point_colors)
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.layouts.calibration import (
-    NO_POINTS,
+    CalibratedImage,
     Calibration,
     PoseConvention,
     Reader,
@@ -95,14 +95,15 @@ _HARMLESS = {
 
 
 @dataclass(frozen=True)
-class _View:
+class _Image(CalibratedImage):
     """One entry of `frames`."""
 
-    camera: Camera
-    lens: Lens
-    place: PurePosixPath  # `file_path`
-    masks: tuple[Path, ...]  # the file at `mask_path`, if there is one
-    time: str
+    time: str = ""
+
+    @property
+    def place(self) -> PurePosixPath:
+        """Place of `file_path`, which is the camera's name."""
+        return _place(self.name)
 
 
 def _place(name: Any) -> PurePosixPath:
@@ -200,10 +201,10 @@ def _sources(path: Path) -> list[Path]:
     return list(filter(Path.is_file, files))
 
 
-def _read_meta(
+def _read_images(
     path: Path, source: Path, clips: Mapping[str, Clip]
-) -> tuple[JsonObject, list[_View]]:
-    """Return the content of a file, and its entries of `frames`."""
+) -> tuple[JsonObject, list[_Image]]:
+    """Return the content of a file, and the images of its `frames`."""
     meta = read_json(source)
     require(
         isinstance(meta, dict), source, "expected an object", repr(meta)[:80], "export it again"
@@ -227,7 +228,7 @@ def _read_meta(
             )
         meta["w"], meta["h"] = size_of_clip(file)
     warn_unread(source, keys - _KEYS - _HARMLESS)
-    views = []
+    images = []
     for index, frame in enumerate(frames):
         values = meta | frame
         where = f"{source}, frame {index}"
@@ -241,16 +242,22 @@ def _read_meta(
         )
         where = f"{where} ({name})"
         mask = values.get("mask_path")
-        views.append(
-            _View(
-                _camera(where, values, name),
-                _lens(where, values),
-                _place(name),
-                (path / _place(mask),) if mask else (),
-                str(values.get("time")),
-            )
-        )
-    return meta, views
+        masks = (path / _place(mask),) if mask else ()
+        camera = _camera(where, values, name)
+        images.append(_Image(camera, _lens(where, values), masks, time=str(values.get("time"))))
+    return meta, images
+
+
+def _read_splits(source: Path, meta: JsonObject) -> dict[str, set[PurePosixPath]]:
+    """Return the places of the images of each split that a file has."""
+    splits = {}
+    for key in _SPLITS:
+        names = meta.get(key)
+        if names is not None:
+            is_list = isinstance(names, list)
+            require(is_list, source, f"`{key}` must be a list", repr(names)[:80], "export it again")
+            splits[key] = set(map(_place, names))
+    return splits
 
 
 def _read_calibration(path: Path) -> Calibration:
@@ -258,18 +265,15 @@ def _read_calibration(path: Path) -> Calibration:
     source, *others = _sources(path)
     if unread := sorted({*path.glob("transforms*.json")} - {source, *others}):
         _LOG.warning("%s: not used: %s.", path, few([file.name for file in unread]))
-    meta, views = _read_meta(path, source, clips)
-    splits: dict[str, set[PurePosixPath]] = {}
-    for key in _SPLITS:
-        if (names := meta.get(key)) is not None:
-            is_list = isinstance(names, list)
-            require(is_list, source, f"`{key}` must be a list", repr(names)[:80], "export it again")
-            splits[key] = set(map(_place, names))
+    meta, images = _read_images(path, source, clips)
+    splits = _read_splits(source, meta)
     for other in others:
-        splits["train_filenames"] = {view.place for view in views}
-        views += _read_meta(path, other, clips)[1]
-    require(views, source, "`frames` must have an entry for each camera", "none", "export it again")
-    places = {view.place for view in views}
+        splits["train_filenames"] = {image.place for image in images}
+        images += _read_images(path, other, clips)[1]
+    require(
+        images, source, "`frames` must have an entry for each camera", "none", "export it again"
+    )
+    places = {image.place for image in images}
     unknown = sorted(set().union(*splits.values()) - places)
     require(
         not unknown,
@@ -278,52 +282,46 @@ def _read_calibration(path: Path) -> Calibration:
         few(unknown, 4),
         "correct or remove these names",
     )
-    calibration, images = match_clips(
-        path, source, clips, [view.camera for view in views], [view.lens for view in views]
-    )
-    times = {view.time for view in views}
+    calibration = match_clips(path, source, clips, images)
+    times = {image.time for image in images}
+    num_images = len(calibration.views[0].images)
     require(
-        len(times) <= len(images[0]),
+        len(times) <= num_images,
         source,
-        f"`time` must have as many values as each camera has images, {len(images[0])}, because "
+        f"`time` must have as many values as each camera has images, {num_images}, because "
         "cameras are fixed",
         len(times),
         "record by fixed cameras, or remove `time` if nothing moves",
     )
-    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
-    training = splits.get("train_filenames", places - held_out)
-    # Per camera whether its images are trained on: true, false or both.
-    trained = [{views[index].place in training for index in indices} for indices in images]
-    kinds_of = dict(zip(calibration.names, trained, strict=True))
-    if mixed := [name for name, kinds in kinds_of.items() if len(kinds) > 1]:
+    test = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
+    training = splits.get("train_filenames", places - test)
+    held_out = []
+    mixed = []
+    for view in calibration.views:
+        is_trained = {_place(image.name) in training for image in view.images}
+        if is_trained == {False}:
+            held_out.append(view.name)
+        elif False in is_trained:
+            mixed.append(view.name)
+    if mixed:
         _LOG.warning(
             "%s: all images of %s are trained on, because the training split has some of them.",
             source,
             few(mixed),
         )
-    test = tuple(name for name, kinds in kinds_of.items() if kinds == {False})
     require(
-        len(test) < len(images),
+        len(held_out) < len(calibration.views),
         source,
         "the splits must leave a camera to train on",
         "none",
         "add one to the training split",
     )
-    with_masks = []
-    for view, indices in zip(calibration.views, images, strict=True):
-        masks = {*view.masks}.union(*(views[index].masks for index in indices))
-        with_masks.append(replace(view, masks=tuple(sorted(masks))))
-    points_file = meta.get("ply_file_path")
-    points, colors = (
-        read_points_ply(path / _place(points_file)) if points_file else (NO_POINTS, NO_POINTS)
-    )
-    return replace(
-        calibration,
-        views=tuple(with_masks),
-        points=points,
-        point_colors=colors,
-        held_out=test if splits else None,
-    )
+    if splits:
+        calibration = replace(calibration, held_out=tuple(held_out))
+    if file := meta.get("ply_file_path"):
+        points, colors = read_points_ply(path / _place(file))
+        calibration = replace(calibration, points=points, point_colors=colors)
+    return calibration
 
 
 READER = Reader(

@@ -16,7 +16,6 @@ import numpy as np
 
 from morgs_mi.capture.layouts.calibration import CalibratedView, Calibration, Reader, required_clips
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
-from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at, rigid
 from morgs_mi.platform.bounded import read_array
 from morgs_mi.platform.checks import errors_at
@@ -93,11 +92,11 @@ def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
     count = read_array(source).shape[:1]
     if (len(clips),) != count == (len(by_frame := clips_by_frame(path)),):
-        check_frames(path, by_frame)
+        check_frames(path, next(iter(by_frame.values())))
         clips = by_frame
     cameras, _ = read_poses_bounds(source, list(clips))
     pairs = zip(cameras, clips.values(), strict=True)
-    return Calibration(tuple(CalibratedView(camera, Lens(), clip) for camera, clip in pairs))
+    return Calibration(tuple(CalibratedView(camera, clip=clip) for camera, clip in pairs))
 
 
 READER = Reader(

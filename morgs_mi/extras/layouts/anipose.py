@@ -24,6 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.layouts.calibration import (
+    CalibratedImage,
     Reader,
     calibration_files,
     only_calibration,
@@ -66,8 +67,8 @@ _FOLDER = re.compile(r"^int_(.+)_img$")
 _MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=", re.MULTILINE) for key in ("matrix", "rotation")]
 
 
-def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
-    """Return the cameras that are not ignored, named as in the file, and their lenses.
+def read_anipose(path: Path) -> list[CalibratedImage]:
+    """Return the cameras that are not ignored, named as in the file.
 
     Raises:
         ValueError: the file is broken, a key of a camera is missing or has another form, or a
@@ -94,11 +95,10 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
     warn_unread(path, keys.union(*entries.values()) - _CAMERA - _HARMLESS)
     if ignored:
         _LOG.warning("%s: tables with `ignore = true` are left out: %s.", path, few(ignored))
-    pairs = [_camera(path, key, entry) for key, entry in entries.items() if key not in ignored]
-    return [camera for camera, _ in pairs], [lens for _, lens in pairs]
+    return [_camera(path, key, entry) for key, entry in entries.items() if key not in ignored]
 
 
-def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Lens]:
+def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> CalibratedImage:
     where = f"{path}, table [{key}]"
     name = entry.get("name", key if key.startswith("cam") else f"cam_{key}")
     require(
@@ -128,7 +128,8 @@ def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Len
     is_fisheye = entry.get("fisheye", False)
     counts = [(4,)] if is_fisheye else [(4,), (5,), (8,)]
     k = _array(where, entry, "distortions", *counts).tolist()
-    return camera, Lens("OPENCV_FISHEYE", tuple(k)) if is_fisheye else opencv_lens(k)
+    lens = Lens("OPENCV_FISHEYE", tuple(k)) if is_fisheye else opencv_lens(k)
+    return CalibratedImage(camera, lens)
 
 
 def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> np.ndarray:

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.layouts.calibration import NO_POINTS, CalibratedView, Calibration, Reader
-from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.io.numbering import natural_key
 from morgs_mi.platform.bounded import read_array, read_json, warn_unread
@@ -108,7 +107,7 @@ def _read_calibration(path: Path) -> Calibration:
     cloud = path / "init_pt_cld.npz"
     points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
     pairs = (rig[name] for name in names)
-    views = tuple(CalibratedView(camera, Lens(), clip) for camera, clip in pairs)
+    views = tuple(CalibratedView(camera, clip=clip) for camera, clip in pairs)
     held_out = tuple(name for name in names if name in test)
     return Calibration(views, points, colors, held_out or None, unused=tuple(empty))
 

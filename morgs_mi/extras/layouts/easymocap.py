@@ -21,7 +21,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import Calibration, Reader, match_clips, required_clips
+from morgs_mi.capture.layouts.calibration import (
+    CalibratedImage,
+    Calibration,
+    Reader,
+    match_clips,
+    required_clips,
+)
 from morgs_mi.capture.layouts.clips import clip_of_camera, size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
@@ -39,8 +45,8 @@ _MAX_LISTS = 10_000
 _FLAGS = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
 
 
-def read_easymocap(path: Path, clips: Mapping[str, Clip]) -> tuple[list[Camera], list[Lens]]:
-    """Return the cameras of `extri.yml`, and their lenses.
+def read_easymocap(path: Path, clips: Mapping[str, Clip]) -> list[CalibratedImage]:
+    """Return the cameras of `extri.yml`.
 
     Args:
         path: the file; `intri.yml` is beside it.
@@ -57,8 +63,7 @@ def read_easymocap(path: Path, clips: Mapping[str, Clip]) -> tuple[list[Camera],
     keys = poses.root().keys()
     names = [key.removeprefix("T_") for key in keys if key.startswith("T_")]
     require(names, path, "expected `T_NN` for each camera NN", "none", "export it again")
-    cameras = []
-    lenses = []
+    images = []
     for name in names:
         K = _matrix(source, intrinsics, f"K_{name}", 9).reshape(3, 3)
         K[:2, 2] += 0.5
@@ -76,13 +81,13 @@ def read_easymocap(path: Path, clips: Mapping[str, Clip]) -> tuple[list[Camera],
                 height = round(intrinsics.getNode(f"H_{name}").real())
             else:
                 width, height = size_of_clip(clips[clip])
-            cameras.append(Camera(K, viewmat, width, height, name))
+            camera = Camera(K, viewmat, width, height, name)
         lens = Lens()
         for key in (f"dist_{name}", f"D_{name}"):
             if _has(intrinsics, key):
                 lens = opencv_lens(_matrix(source, intrinsics, key, 4, 5, 8).tolist())
-        lenses.append(lens)
-    return cameras, lenses
+        images.append(CalibratedImage(camera, lens))
+    return images
 
 
 def _read_storage(path: Path) -> cv2.FileStorage:
@@ -133,7 +138,7 @@ def _sources(path: Path) -> list[Path]:
 def _read_calibration(path: Path) -> Calibration:
     source = _sources(path)[0]
     clips = required_clips(path)
-    calibration, _ = match_clips(path, source, clips, *read_easymocap(source, clips))
+    calibration = match_clips(path, source, clips, read_easymocap(source, clips))
     if any(view.masks for view in calibration.views):
         _LOG.warning("%s: not used, because masks of each frame are not read.", path / "masks")
     views = tuple(replace(view, masks=()) for view in calibration.views)

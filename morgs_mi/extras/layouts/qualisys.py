@@ -24,13 +24,14 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from morgs_mi.capture.layouts.calibration import (
+    CalibratedImage,
     Calibration,
     PoseConvention,
     Reader,
     calibration_files,
     only_calibration,
 )
-from morgs_mi.capture.lens import Lens, opencv_lens
+from morgs_mi.capture.lens import opencv_lens
 from morgs_mi.core.camera import Camera, pose_at, rigid
 from morgs_mi.platform.bounded import check_claim, read_bytes, warn_unread
 from morgs_mi.platform.checks import LARGEST, bounded, errors_at, require
@@ -65,9 +66,8 @@ _READ = {
 _REMEDY = "export the calibration again"
 
 
-def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
-    """Return the active cameras, named by their serial numbers, and their lenses; world units are
-    metres.
+def read_qualisys(path: Path) -> list[CalibratedImage]:
+    """Return the active cameras, named by their serial numbers; world units are metres.
 
     Raises:
         ValueError: the file is broken, an element or attribute of a camera is missing or is no
@@ -102,8 +102,7 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
         elif element.tag not in _HARMLESS:
             unread.add(element.tag)
     warn_unread(path, unread)
-    cameras, lenses = zip(*(_camera(path, element) for element in active), strict=True)
-    return list(cameras), list(lenses)
+    return [_camera(path, element) for element in active]
 
 
 class _Plain(ElementTree.TreeBuilder):
@@ -115,7 +114,7 @@ class _Plain(ElementTree.TreeBuilder):
         raise ValueError("it declares a document type")
 
 
-def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
+def _camera(path: Path, element: Element) -> CalibratedImage:
     serial = element.get("serial", "")
     where = f"{path}, camera {serial!r}"
     require(serial, path, "every `camera` must have a `serial`", "one without", _REMEDY)
@@ -129,7 +128,8 @@ def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
     lens = opencv_lens(_numbers(where, element, "intrinsic", _DISTORTION))
     with errors_at(where):
         width = round(right - left + 1)
-        return Camera(K, viewmat, width, round(bottom - top + 1), serial), lens
+        camera = Camera(K, viewmat, width, round(bottom - top + 1), serial)
+    return CalibratedImage(camera, lens)
 
 
 def _numbers(where: str, camera: Element, name: str, keys: Sequence[str]) -> list[float]:

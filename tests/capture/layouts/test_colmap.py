@@ -56,7 +56,7 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path, kind):
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         assert_allclose(camera.K, expected.K, rtol=1e-12)
         assert_close(camera.viewmat, expected.viewmat, atol=1e-12)
-        assert model.lenses[i] == lens
+        assert model.images[i].lens == lens
     assert model.points.dtype == np.float64
     rows = np.lexsort(model.points.T), np.lexsort(POINTS.T)
     assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)

@@ -17,7 +17,7 @@ from morgs_mi.capture.layouts import reader_registry
 from morgs_mi.capture.layouts.calibration import CalibratedView, Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.capture.lens import MODELS, Lens
+from morgs_mi.capture.lens import MODELS
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
@@ -451,7 +451,7 @@ def test_load_capture__of_a_far_rig_is_relative_to_an_origin(tmp_path, caplog, m
 def test_centred__keeps_points_that_are_exact(tmp_path, kind, count):
     cameras = moved(rig(("cam1", "cam2", "cam3")), -FAR)
     points = (FAR[None] + 0.1).astype(kind)
-    views = tuple(CalibratedView(camera, Lens(), tmp_path) for camera in cameras)
+    views = tuple(CalibratedView(camera, clip=tmp_path) for camera in cameras)
     calibration = Calibration(views, points, points).centred(tmp_path)
     assert_close(calibration.points, (points - calibration.origin)[:count], atol=1e-6)
     assert calibration.points.dtype == np.float32

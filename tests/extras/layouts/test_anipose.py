@@ -66,9 +66,9 @@ def test_anipose__reads_the_tables_of_caliscope(tmp_path):
         f"distortions = [0.0, 0.0, 0.0, 0.0, 0.0]\nrotation = {rotation}\n"
         f"translation = {camera.viewmat[:3, 3].tolist()}\n"
     )
-    (result,), _ = read_anipose(path / "calibration.toml")
+    (result,) = read_anipose(path / "calibration.toml")
     assert result.name == "cam_1"
-    assert_close(result.viewmat, camera.viewmat, atol=1e-9)
+    assert_close(result.camera.viewmat, camera.viewmat, atol=1e-9)
 
 
 def test_anipose__leaves_out_cameras_that_caliscope_ignores(tmp_path, caplog):

@@ -41,13 +41,14 @@ def test_qualisys__projects_by_the_conventions_of_the_file(tmp_path):
         'radialDistortion1="-0.1" radialDistortion2="0" radialDistortion3="0" '
         'tangentalDistortion1="0" tangentalDistortion2="0"/></camera></cameras></calibration>'
     )
-    ((camera,), (lens,)) = read_qualisys(tmp_path / "rig.qca.txt")
+    (image,) = read_qualisys(tmp_path / "rig.qca.txt")
+    camera = image.camera
     assert (camera.width, camera.height, camera.name) == (100, 80, "7")
     pixels, depths = camera.project(np.array([(0, 0, 0), (0.2, 0, 0), (0, 0.2, 1)]))
     # f = 100 px: 0.2 m to the right at 2 m are 10 px; 0.2 m up in the image at 1 m are 20 px.
     assert_close(pixels, np.array([(50, 40), (60, 40), (50, 20)]), atol=1e-9)
     assert depths.tolist() == [2, 2, 1]
-    assert lens.distortion == (-0.1, 0, 0, 0), "coefficients have no unit"
+    assert image.lens.distortion == (-0.1, 0, 0, 0), "coefficients have no unit"
 
 
 def test_qualisys__undistorts_a_dot_to_where_the_camera_projects_it(tmp_path):
@@ -77,8 +78,8 @@ def test_qualisys__warns_of_rotated_views_and_ignores_inactive_cameras(tmp_path,
         + second.replace('ion="0"', 'ion="180"', 1)
     )
     (path / "rig.qca.txt").write_text(text)
-    cameras, _ = read_qualisys(path / "rig.qca.txt")
-    assert [camera.name for camera in cameras] == ["28984", "29005", "31111"]
+    images = read_qualisys(path / "rig.qca.txt")
+    assert [image.name for image in images] == ["28984", "29005", "31111"]
     assert "QTM displays 28984 rotated (viewrotation)" in caplog.text
 
 
