@@ -5,9 +5,9 @@ are stored per camera or per frame; cameras are ordered numerically, cam_2 befor
 
 - per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png`` (or ``color``,
   ``rgb``), in the capture or in a folder of it (``videos/cam01.mp4``, ``images/cam01/0000.png``).
-  Of several clips of one name the lossless one in ``frames/`` takes precedence, then a video, then
-  a folder; clips in the capture itself take precedence over those in a folder, and those in the
-  folder ``images`` or ``videos`` over those in others, which are otherwise refused;
+  Of several clips of one name the one in ``frames/`` takes precedence, then a video, then a folder;
+  clips in the capture itself take precedence over those in a folder, and those in the folder
+  ``images`` or ``videos`` over those in others, which are otherwise refused;
 - per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
 - photos: ``cam01.png`` or ``images/cam01.png``, one image per camera;
 - in folders of folders: ``images/rig1/cam01/0000.png`` or photos ``images/day/1.png``, where
@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -72,22 +71,18 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     Raises:
         ValueError: two videos in one folder differ only in their suffixes.
     """
-    inner = _places(path)
-    in_others = [_folders(place) | _videos(place) for place in inner if place.name not in _USUAL]
-    names = set().union(*in_others)
-    # Rigs and memory cards repeat the names of their clips.
-    clips = (
-        clips_by_rig(path) if len(names) < sum(map(len, in_others)) else dict(ChainMap(*in_others))
-    )
-    for place in inner[len(in_others) :]:
-        usual = _folders(place) | _videos(place)
-        if repeats := [name for name in usual if name in clips]:
-            first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, usual))
+    clips: dict[str, Path] = {}
+    for place in _places(path):
+        inner = _clips(place)
+        if repeats := [name for name in inner if name in clips]:
+            if place.name not in _USUAL:
+                return clips_by_rig(path)  # rigs and memory cards repeat the names of their clips
+            first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, inner))
             _LOG.warning("%s: clips such as %s are used, not %s.", path, last, first)
-        clips |= usual
-    clips |= _folders(path) | _videos(path)
+        clips |= inner
+    clips |= _clips(path)
     if (path / "frames").is_dir():
-        clips |= _videos(path / "frames") | _folders(path / "frames")
+        clips |= _clips(path / "frames")
     return _in_order(clips)
 
 
@@ -257,6 +252,13 @@ def size_of_clip(clip: Clip) -> tuple[int, int]:
         clip = (clip,)  # its header does not show its size
     reader = open_frames(clip)
     return reader.width, reader.height
+
+
+def _clips(folder: Path) -> dict[str, Path]:
+    """Return the folders of images and the videos in a folder by their names; a video takes
+    precedence.
+    """
+    return _folders(folder) | _videos(folder)
 
 
 def _folders(folder: Path) -> dict[str, Path]:
