@@ -16,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.capture.camera_source import CameraSource
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.calibration import CalibratedView
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.reader_registry import find_reader
-from morgs_mi.capture.lens import Lens, undistortion
+from morgs_mi.capture.recorded_view import RecordedView
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_stops
@@ -37,62 +36,6 @@ from morgs_mi.platform.files import CAPTURE
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
 MIN_SIDE = 32
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedView(View):
-    """A view of a recording: a camera with its clip."""
-
-    source: CameraSource = field(kw_only=True, repr=False)  #: The clip.
-    #: Radial terms k1, k2 of the distortion left in the images, which is removed as well.
-    distortion: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def recorded_size(self) -> tuple[int, int]:
-        """Width and height of the clip, px."""
-        return self.source.reader.width, self.source.reader.height
-
-    def with_camera(self, camera: Camera) -> RecordedView:
-        """Return the view with a camera of another size, and its mask."""
-        return replace(self, camera=camera, mask=self.source.mask(camera))
-
-    def at_recorded_size(self) -> RecordedView:
-        """Return the view without downscaling."""
-        return self.with_camera(self.camera.resized(*self.recorded_size))
-
-    def refined(self, camera: Camera, distortion: tuple[float, float]) -> RecordedView:
-        """Return the view with a refined camera, and images without a distortion left in them."""
-        size = self.recorded_size
-        recorded = self.camera.resized(*size), camera.resized(*size)
-        maps = undistortion(
-            recorded[0], self.source.lens, (recorded[1], Lens("RADIAL", distortion))
-        )
-        source = replace(self.source, undistortion=maps)
-        return replace(self, source=source, distortion=distortion).with_camera(camera)
-
-    def process(self, image: np.ndarray) -> np.ndarray:
-        """Return a recorded image [H, W, 3] as frames have it: undistorted, downscaled and
-        colour-corrected.
-        """
-        return self.source.process(image, self.camera)
-
-    def metadata(self) -> JsonObject:
-        """Return the reading of the clip in JSON types."""
-        camera = self.camera
-        source = self.source
-        delays = {"delay": camera.delay, "readout": camera.readout}
-        return {
-            "name": camera.name,
-            "first_frame": int(source.times.frame_indices[0]),
-            "recorded_size": list(self.recorded_size),
-            "size": [camera.width, camera.height],
-            "K": camera.K.tolist(),
-            "lens": source.lens.model,
-            "distortion": list(source.lens.distortion),
-            "undistortion": "none" if source.undistortion is None else "cubic, same intrinsics",
-            "valid_share": 1.0 if self.mask is None else float(self.mask.mean()),
-            **{name: value for name, value in delays.items() if value},
-        }
 
 
 @dataclass(frozen=True)
@@ -234,7 +177,7 @@ class Capture:
     @property
     def first_clip(self) -> str:
         """Path of the first camera's video or folder of images, relative to the capture."""
-        return os.path.relpath(self.views[0].source.reader.path, self.path)
+        return os.path.relpath(self.views[0].reader.path, self.path)
 
     @property
     def reference_view(self) -> int:
@@ -254,10 +197,7 @@ class Capture:
         """Return the capture with images of 8 bits: linear light as a display shows it."""
         if self.display_exposure is None:
             return self
-        views = []
-        for view in self.views:
-            source = replace(view.source, display_exposure=self.display_exposure)
-            views.append(replace(view, source=source))
+        views = (replace(view, display_exposure=self.display_exposure) for view in self.views)
         return replace(self, views=Views(views), display_exposure=None)
 
     def with_cameras(
@@ -332,8 +272,7 @@ class Capture:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """
-        stop = self.num_frames if stop is None else min(stop, self.num_frames)
-        return self.views[view].source.images(self.cameras[view], start, stop)
+        return self.views[view].images(start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Return the cameras of a stream of this capture with the delays and readouts of the
@@ -347,11 +286,10 @@ class Capture:
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
-        streams = [self.images(view, start, stop) for view in range(len(self.views))]
+        streams = [view.images(start, stop) for view in self.views]
         missing: set[str] = set()
         try:
             for index, results in enumerate(zip(*streams, strict=True), start=start):
-                images = tuple(None if isinstance(f, Exception) else f for f in results)
                 pairs = zip(self.names, results, strict=True)
                 errors = {name: f for name, f in pairs if isinstance(f, Exception)}
                 if strict and errors:
@@ -361,29 +299,18 @@ class Capture:
                 missing = set(errors)
                 # With gaps, timestamps without an image are part of the recording.
                 unread = bool(errors) and not (
-                    self.reading.gaps and os.path.exists(self.views[0].source.reader.path)
+                    self.reading.gaps and os.path.exists(self.views[0].reader.path)
                 )
+                recorded = self.views.at([None if isinstance(f, Exception) else f for f in results])
+                # The motion in the first frame is unknown, so delays cannot be rendered.
+                views = recorded
+                if index == 0:
+                    views = Views(map(RecordedView.at_first_timestamp, self.views, recorded))
                 problems = tuple(f"{name}: {error}" for name, error in errors.items())
-                views = self.views.at(images)
-                if index == 0 and any(view.source.times.delay for view in self.views):
-                    # The motion in the first frame is unknown, so delays cannot be rendered.
-                    first = Views(map(_at_timestamp, self.views, views))
-                    yield PartialFrame(index, first, problems, views, unread)
-                else:
-                    yield PartialFrame(index, views, problems, None, unread)
+                yield PartialFrame(index, views, problems, recorded, unread)
         finally:
             for stream in streams:
                 stream.close()
-
-
-def _at_timestamp(view: RecordedView, first: View) -> View:
-    """Return a view with the image of the first timestamp, interpolated if its clip has a delay;
-    one that cannot be interpolated stays as it is.
-    """
-    if not (first.has_image and view.source.times.delay):
-        return first
-    image = next(view.source.at_timestamps().images(view.camera, 0, 1))
-    return first.at(image) if isinstance(image, np.ndarray) else first
 
 
 def load_capture(
@@ -416,6 +343,54 @@ def load_capture(
             broken, or an argument is out of range.
     """
     path = Path(path)
+    _check_arguments(path, downscale, max_frames)
+    reading = reading or ReadConfig()
+    settings = read_settings(path / CAPTURE)
+    layout = find_reader(path)
+    every = layout.read(path).centred(path)
+    calibration = every.without(path, reading.without)
+    readers = open_clips(calibration.clips, reading.gaps, settings.get("white"))
+    calibrated = _at_clip_sizes(path, calibration.views, readers)
+    common = timeline(path, readers, reading, max_frames, settings.get("fps"))
+    readouts = _readouts(path / CAPTURE, settings.get("readout", 0.0), every.names)
+    _check_downscale(downscale, calibrated)
+    views = []
+    for calibrated_view in calibrated:
+        name = calibrated_view.name
+        times = common.clips[name]
+        view = RecordedView.of(calibrated_view, readers[name], times)
+        camera = _downscaled(view.camera, downscale, times, readouts.get(name, 0.0))
+        views.append(view.with_camera(camera))
+    capture = Capture(
+        path=path,
+        views=Views(views),
+        num_frames=common.num_frames,
+        fps=common.fps,
+        points=calibration.points,
+        point_colors=calibration.point_colors,
+        # The frames of the ground truth are numbered like the frames of the clips.
+        truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
+        downscale=downscale,
+        layout=layout.name,
+        reading=reading,
+        notes=(
+            *common.notes,
+            *(note for view in views for note in view.notes),
+            *_photos(calibrated),
+        ),
+        origin=calibration.origin,
+    )
+    capture = capture.with_cameras(with_near_planes(capture.cameras, capture.points, reading.near))
+    capture = capture.holding_out(held_out_by(path, test_view, settings, every, calibration))
+    if not any(reader.has_light for reader in readers.values()):
+        return capture
+    stops = settings.get("display_exposure")
+    if stops is None:
+        stops = display_stops(next(capture.partial_frames(0, 1)).images)
+    return replace(capture, display_exposure=stops)
+
+
+def _check_arguments(path: Path, downscale: float, max_frames: int | None) -> None:
     if not path.is_dir():
         kind = "a file" if path.is_file() else "none"
         raise FileNotFoundError(
@@ -426,57 +401,6 @@ def load_capture(
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
         raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
-    reading = reading or ReadConfig()
-    settings = read_settings(path / CAPTURE)
-    reader = find_reader(path)
-    every = reader.read(path).centred(path)
-    calibration = every.without(path, reading.without)
-    opened = open_clips(
-        [view.clip for view in calibration.views], reading.gaps, settings.get("white")
-    )
-    readers = dict(zip(calibration.names, opened, strict=True))
-    calibrated = _at_clip_sizes(path, calibration.views, readers)
-    common = timeline(path, readers, reading, max_frames, settings.get("fps"))
-    sources = [
-        CameraSource.of(readers[v.name], v.lens, v.camera, v.masks, common.clips[v.name])
-        for v in calibrated
-    ]
-    readouts = _readouts(path / CAPTURE, settings.get("readout", 0.0), every.names)
-    _check_downscale(downscale, [view.camera for view in calibrated])
-    cameras = [
-        _downscaled(view.camera, downscale, common.clips[view.name], readouts.get(view.name, 0.0))
-        for view in calibrated
-    ]
-    cameras = with_near_planes(cameras, calibration.points, reading.near)
-    test = held_out_by(path, test_view, settings, every, calibration)
-    capture = Capture(
-        path=path,
-        views=Views(
-            RecordedView(camera, mask=source.mask(camera), held_out=v in test, source=source)
-            for v, (camera, source) in enumerate(zip(cameras, sources, strict=True))
-        ),
-        num_frames=common.num_frames,
-        fps=common.fps,
-        points=calibration.points,
-        point_colors=calibration.point_colors,
-        # The frames of the ground truth are numbered like the frames of the clips.
-        truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
-        downscale=downscale,
-        layout=reader.name,
-        reading=reading,
-        notes=(
-            *common.notes,
-            *(n for source in sources for n in source.notes),
-            *_photos(calibrated),
-        ),
-        origin=calibration.origin,
-    )
-    if any(reader.has_light for reader in opened):
-        stops = settings.get("display_exposure")
-        if stops is None:
-            stops = display_stops(next(capture.partial_frames(0, 1)).images)
-        capture = replace(capture, display_exposure=stops)
-    return capture
 
 
 def _at_clip_sizes(
@@ -509,9 +433,8 @@ def _at_clip_sizes(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
             "intrinsics are scaled.",
             path,
-            few([c.name for c in scaled]),
-            scaled[0].width,
-            scaled[0].height,
+            few([camera.name for camera in scaled]),
+            *scaled[0].size,
         )
     return recorded
 
@@ -520,22 +443,19 @@ def _readouts(file: Path, setting: Any, names: Sequence[str]) -> dict[str, float
     """Return the readouts of cameras by their names, in frames of the clips; `setting` is a number
     for all of them, or an object with some.
     """
-    readouts: JsonObject = dict.fromkeys(names, setting)
-    if isinstance(setting, dict):
-        readouts = setting
+    readouts: JsonObject = setting if isinstance(setting, dict) else dict.fromkeys(names, setting)
     check_names(file, "readout", readouts, names)
     return {composed(name): readout for name, readout in readouts.items()}
 
 
-def _check_downscale(downscale: float, cameras: Sequence[Camera]) -> None:
+def _check_downscale(downscale: float, views: Sequence[CalibratedView]) -> None:
     """Check that downscaled images have the least size."""
-    shortest = min(min(camera.width, camera.height) for camera in cameras)
+    shortest = min(min(view.camera.size) for view in views)
     if downscale > 1 and round(shortest / downscale) < MIN_SIDE:
-        largest = shortest / MIN_SIDE
-        remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
+        largest = max(1, shortest / MIN_SIDE)
         raise ValueError(
             f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
-            f"side, got {downscale:g}; {remedy}."
+            f"side, got {downscale:g}; use at most {np.floor(100 * largest) / 100:g}."
         )
 
 
@@ -549,8 +469,7 @@ def _downscaled(camera: Camera, downscale: float, times: ClipTimes, readout: flo
 
 
 def _photos(views: Sequence[CalibratedView]) -> list[str]:
-    """Return a note if the clips are photos, one per camera, in one folder."""
-    photos = [v.clip[0] for v in views if isinstance(v.clip, tuple) and len(v.clip) == 1]
-    if len(photos) < len(views) or len({file.parent for file in photos}) > 1:
+    """Return a note if each clip is a photo."""
+    if not all(isinstance(view.clip, tuple) and len(view.clip) == 1 for view in views):
         return []
-    return [f"{len(photos)} photos of a static scene, one per camera; a recording has {EXAMPLE}"]
+    return [f"{len(views)} photos of a static scene, one per camera; a recording has {EXAMPLE}"]

@@ -7,10 +7,10 @@ A timestamp t = 0, 1, ... is a frame of the recording. It is shown by frame k of
 Folders of images have an o and r by the numbers of their images, too. The numbers are times: images
 with the same number are simultaneous.
 
-In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows
-the timestamp. If o is not whole, the clip has no frame of the timestamp. With a whole r, the
-nearest frame is used unchanged: it is always later by the same time, the camera's delay (see
-`Camera`). Otherwise an image is interpolated between two frames (see `interpolation`).
+If k is not whole, the nearest frame shows the timestamp; in a clip of variable frame rate, k is a
+position on its regular clock. If only o is not whole, this frame is always later by the same time,
+the camera's delay (see `Camera`), and the image of the first timestamp is interpolated between two
+frames (see `interpolation`).
 """
 
 from __future__ import annotations
@@ -69,11 +69,10 @@ class ClipTimes:
     """Frames of one clip that show the timestamps of the recording."""
 
     frame_indices: np.ndarray  #: The clip's frames in ascending order, -1 for none, int [T].
-    #: Share of the time to the next frame that has passed at each timestamp [T]; None: no image is
-    #: interpolated.
-    shares: np.ndarray | None
-    delay: float  #: Time from a timestamp to the frame that shows it, in frames of the clip.
+    #: Positions of the images on the clip's regular clock [T].
+    positions: np.ndarray
     rate: float  #: Frames of the clip per timestamp.
+    delay: float = 0.0  #: Time from a timestamp to the frame that shows it, in frames of the clip.
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +89,37 @@ class Timeline:
     def num_frames(self) -> int:
         """Number of timestamps."""
         return len(next(iter(self.clips.values())).frame_indices)
+
+
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """A clip with its offset o and rate r (see the module's docstring)."""
+
+    reader: FrameReader
+    length: int  # number of positions that the clip covers
+    offset: float
+    rate: float
+    is_shifted: bool  # whether its offset is not whole
+
+    def timestamp(self, positions: np.ndarray | int) -> np.ndarray:
+        """Return the timestamps [...] at positions [...] of the clip."""
+        return (np.asarray(positions) - self.offset) / self.rate
+
+    def times(self, timestamps: np.ndarray, gaps: bool) -> ClipTimes:
+        """Return the frames that show the timestamps [T]; with `gaps`, none that is far."""
+        positions = self.offset + self.rate * timestamps
+        if self.is_shifted and self.rate % 1 == 0:
+            delay = float(np.floor(positions[0] + 0.5) - positions[0])
+            return ClipTimes(np.rint(positions + delay).astype(int), positions, self.rate, delay)
+        indices = nearest_frames(self.reader, positions)
+        exact = self.reader.positions
+        places = indices if exact is None else exact[indices]
+        if gaps:
+            indices = np.where(np.abs(places - positions) > _NEAR, -1, indices)
+        return ClipTimes(indices, places, self.rate)
+
+
+_Clocks = dict[str, _Clock]  # by the names of the cameras
 
 
 def timeline(
@@ -115,21 +145,21 @@ def timeline(
     """
     check_names(path, "offset", config.offset, [*readers])
     config = replace(config, offset={composed(name): o for name, o in config.offset.items()})
-    exact, notes = _by_numbers(path, readers, config, _clocks(readers, config, fps))
+    exact, fps = _clocks(readers, config, fps)
+    exact, fps, notes = _by_numbers(path, exact, config, fps)
     notes += _notes_of_clips(readers)
     if not config.offset:
         notes += _time_codes(readers)
     for note in notes:
         _LOG.warning("%s: %s", path, note)
     if config.trim or config.offset:
-        clocks = _without_drift(exact, readers, max_frames)
-        timestamps = _common_timestamps(path, readers, config, clocks)[:max_frames]
+        clocks = _without_drift(exact, max_frames)
+        timestamps = _common_timestamps(path, clocks, config, fps)[:max_frames]
     else:
-        clocks = replace(exact, rates=np.ones(len(readers)))
-        count = _num_frames(path, [*readers.values()], max_frames, config.gaps)
-        timestamps = np.arange(count, dtype=float)
+        clocks = {name: replace(clock, rate=1.0) for name, clock in exact.items()}
+        timestamps = np.arange(_num_frames(path, clocks, max_frames, config.gaps), dtype=float)
         # Frames with the same index must be simultaneous.
-        drift = np.ptp(exact.rates) * (len(timestamps) - 1)
+        drift = np.ptp([clock.rate for clock in exact.values()]) * (len(timestamps) - 1)
         if drift > _NEAR:
             rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers.values() if r.fps)
             raise ValueError(
@@ -137,62 +167,61 @@ def timeline(
                 f"{drift:.1f} frames apart; use the lowest one with --trim, or set `fps` in "
                 "capture.json."
             )
-    clips = {}
-    times = np.zeros((len(readers), len(timestamps)))
-    has_frame = np.zeros(times.shape, bool)
-    for c, (name, reader) in enumerate(readers.items()):
-        positions = clocks.offsets[c] + clocks.rates[c] * timestamps
-        clip = _clip_times(reader, positions, float(clocks.rates[c]), config.offset.get(name, 0))
-        places = _image_positions(reader, clip, positions)
-        if config.gaps:
-            # Images that are far from their timestamps are left out.
-            is_far = np.abs(places - positions) > _NEAR
-            clip = replace(clip, frame_indices=np.where(is_far, -1, clip.frame_indices))
-        clips[name] = clip
-        times[c] = (places - exact.offsets[c]) / exact.rates[c]
-        has_frame[c] = clip.frame_indices >= 0
-    # Images of one timestamp that are apart, by the clips' clocks.
-    latest = np.where(has_frame, times, -np.inf).max(axis=0)
-    earliest = np.where(has_frame, times, np.inf).min(axis=0)
-    spread = float(np.max(latest - earliest, initial=0)) / exact.fps
+    clips = {name: clock.times(timestamps, config.gaps) for name, clock in clocks.items()}
+    spread = _spread(clips, exact) / fps
     if spread > 1e-3:
         _LOG.warning("%s: images of one timestamp are up to %.1f ms apart.", path, 1e3 * spread)
     unchanged = not any(config.offset.values()) and all(
-        np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices)))
-        for clip in clips.values()
+        np.array_equal(clip.frame_indices, np.arange(len(timestamps))) for clip in clips.values()
     )
+    for name, clip in clips.items():
+        if clocks[name].reader.positions is not None:
+            notes.append(_note_of_variable_rate(clocks[name], clip.frame_indices))
+    return Timeline(clips, fps, unchanged, tuple(notes))
+
+
+def _clocks(
+    readers: Mapping[str, FrameReader], config: ReadConfig, fps: float | None
+) -> tuple[_Clocks, float]:
+    """Return the clocks of the clips by their offsets and their frame rates, and the number of
+    timestamps per second.
+    """
+    clip_fps = {name: fps or reader.fps for name, reader in readers.items()}
+    lowest = min(filter(None, clip_fps.values()), default=_DEFAULT_FPS)
+    clocks = {}
     for name, reader in readers.items():
-        if reader.positions is not None and reader.fps:
-            frames = clips[name].frame_indices
-            frames = frames[frames >= 0]
-            repeats = len(frames) - len(np.unique(frames))
-            late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
-            notes.append(
-                f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
-                f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to "
-                f"{1e3 * late:.1f} ms off; each timestamp has the frame nearest in time: {repeats} "
-                f"repeat one, {len(timestamps) - len(frames)} have none."
-            )
-    return Timeline(clips, exact.fps, unchanged, tuple(notes))
+        offset = float(config.offset.get(name, 0))
+        rate = (clip_fps[name] or lowest) / lowest
+        if reader.positions is None:
+            # A truncated clip can be trimmed.
+            length = reader.num_frames if config.gaps else reader.num_held
+            is_shifted = offset % 1 != 0 and reader.num_frames > 1
+            clocks[name] = _Clock(reader, length, offset, rate, is_shifted)
+        else:
+            # Of a frame before the first or after the last one, too.
+            index = round(offset)
+            nearest = min(max(index, 0), len(reader.positions) - 1)
+            offset = float(round(reader.positions[nearest]) + index - nearest)
+            length = round(reader.positions[-1]) + 1
+            clocks[name] = _Clock(reader, length, offset, rate, False)
+    return clocks, lowest
 
 
 def _by_numbers(
-    path: Path,
-    readers: Mapping[str, FrameReader],
-    config: ReadConfig,
-    clocks: _Clocks,
-) -> tuple[_Clocks, list[str]]:
-    """Return the clocks of clips by the numbers of their images, too, and a sentence for each
-    assumption.
+    path: Path, clocks: _Clocks, config: ReadConfig, fps: float
+) -> tuple[_Clocks, float, list[str]]:
+    """Return the clocks of clips by the numbers of their images, too, the number of timestamps per
+    second, and a sentence for each assumption.
     """
+    readers = {name: clock.reader for name, clock in clocks.items()}
     numbers = {name: clip.numbers for name, clip in readers.items() if clip.numbers is not None}
     moving = any(len(clip) > 1 for clip in numbers.values())
     if not moving or len({(clip[0], clip.step) for clip in numbers.values()}) == 1:
-        return clocks, []
+        return clocks, fps, []
     table = ", ".join(f"{name} {_range(clip)}" for name, clip in numbers.items())
     if config.offset and not config.trim:
         note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
-        return clocks, [note]
+        return clocks, fps, [note]
     common = sorted(set.intersection(*map(set, numbers.values())))
     if not config.trim or not common:
         remedy = (
@@ -211,14 +240,14 @@ def _by_numbers(
     steps = [clip.step for clip in numbers.values()]
     # Other clips start with the first of these numbers.
     first = min(clip[0] for clip in numbers.values())
-    clips = [numbers.get(name, range(first, first + 1, min(steps))) for name in readers]
-    offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
-    return _Clocks(
-        clocks.offsets + offsets * clocks.rates,
-        clocks.rates * np.array([lcm(*steps) / clip.step for clip in clips]),
-        # The time between two timestamps, in frames of the clip with the most frames per time.
-        clocks.fps / (lcm(*steps) / min(steps)),
-    ), [note]
+    aligned = {}
+    for name, clock in clocks.items():
+        clip = numbers.get(name, range(first, first + 1, min(steps)))
+        offset = clock.offset + (common[0] - clip[0]) / clip.step * clock.rate
+        rate = clock.rate * lcm(*steps) / clip.step
+        aligned[name] = replace(clock, offset=offset, rate=rate)
+    # The time between two timestamps, in frames of the clip with the most frames per time.
+    return aligned, fps / (lcm(*steps) / min(steps)), [note]
 
 
 def _notes_of_clips(readers: Mapping[str, FrameReader]) -> list[str]:
@@ -247,6 +276,20 @@ def _time_codes(readers: Mapping[str, FrameReader]) -> list[str]:
     ]
 
 
+def _note_of_variable_rate(clock: _Clock, frame_indices: np.ndarray) -> str:
+    """Return a sentence on a clip of variable frame rate, and on its frames that are shown [T]."""
+    positions = clock.reader.positions
+    period = 1e3 / clock.reader.fps
+    late = np.abs(positions - np.rint(positions)).max() * period
+    frames = frame_indices[frame_indices >= 0]
+    return (
+        f"{clock.reader.path.name}: variable frame rate, {len(positions)} frames in {clock.length} "
+        f"periods of {period:.1f} ms, up to {late:.1f} ms off; each timestamp has the frame "
+        f"nearest in time: {len(frames) - len(np.unique(frames))} repeat one, "
+        f"{len(frame_indices) - len(frames)} have none."
+    )
+
+
 def _range(numbers: Sequence[int]) -> str:
     if len(numbers) == 1:
         return str(numbers[0])
@@ -255,97 +298,44 @@ def _range(numbers: Sequence[int]) -> str:
     return text if step == 1 else f"{text} by {step}"
 
 
-def _clip_times(
-    reader: FrameReader, positions: np.ndarray, rate: float, offset: float
-) -> ClipTimes:
-    """Return the frames of a clip that show the timestamps at `positions` [T], by the clip's rate
-    and its offset in `ReadConfig`.
+def _spread(clips: Mapping[str, ClipTimes], clocks: _Clocks) -> float:
+    """Return the largest time between two images of one timestamp by the clips' clocks, in
+    timestamps.
     """
-    if reader.positions is not None or reader.num_frames < 2 or offset % 1 == 0:
-        return ClipTimes(nearest_frames(reader, positions), None, 0.0, rate)
-    if rate % 1 == 0:
-        # The same for all of its frames.
-        delay = float(np.floor(positions[0] + 0.5) - positions[0])
-        return ClipTimes(np.rint(positions + delay).astype(int), None, delay, rate)
-    indices = np.clip(np.floor(positions).astype(int), 0, reader.num_frames - 2)
-    return ClipTimes(indices, positions - indices, 0.0, rate)
+    times = np.array([clocks[name].timestamp(clip.positions) for name, clip in clips.items()])
+    times[np.array([clip.frame_indices < 0 for clip in clips.values()])] = np.nan  # no image
+    return float(np.fmax.reduce(np.fmax.reduce(times) - np.fmin.reduce(times), initial=0))
 
 
-def _image_positions(reader: FrameReader, clip: ClipTimes, positions: np.ndarray) -> np.ndarray:
-    """Return the positions of the images that show the timestamps at `positions` [T]."""
-    if clip.shares is not None:
-        return positions
-    if reader.positions is not None:
-        return reader.positions[clip.frame_indices]
-    return clip.frame_indices - clip.delay
-
-
-@dataclass(frozen=True)
-class _Clocks:
-    """Offset o and rate r of every clip [C], and the number of timestamps per second (see the
-    module's docstring).
-    """
-
-    offsets: np.ndarray
-    rates: np.ndarray
-    fps: float
-
-
-def _clocks(readers: Mapping[str, FrameReader], config: ReadConfig, fps: float | None) -> _Clocks:
-    """Return the clocks of the clips by their offsets and their frame rates."""
-    clip_fps = [fps or reader.fps for reader in readers.values()]
-    lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
-    offsets = np.array([config.offset.get(name, 0) for name in readers], float)
-    for c, reader in enumerate(readers.values()):
-        if reader.positions is not None:
-            # Of a frame before the first or after the last one, too.
-            index = round(float(offsets[c]))
-            nearest = min(max(index, 0), len(reader.positions) - 1)
-            offsets[c] = round(reader.positions[nearest]) + index - nearest
-    return _Clocks(offsets, np.array([(rate or lowest) / lowest for rate in clip_fps]), lowest)
-
-
-def _without_drift(
-    clocks: _Clocks, readers: Mapping[str, FrameReader], max_frames: int | None
-) -> _Clocks:
+def _without_drift(clocks: _Clocks, max_frames: int | None) -> _Clocks:
     """Return the clocks with a whole rate r for each clip that differs from it by less than half a
     frame in the end.
 
     Programs write 29.97 or 30 fps for the same camera. The distance of the frames from a timestamp
     is then constant.
     """
-    periods = min(
-        _periods(reader) / rate for reader, rate in zip(readers.values(), clocks.rates, strict=True)
-    )
-    whole = np.maximum(1, np.rint(clocks.rates))
-    drift = np.abs(whole - clocks.rates) * (min(periods, max_frames or periods) - 1)
-    return replace(clocks, rates=np.where(drift < _NEAR, whole, clocks.rates))
+    periods = min(clock.length / clock.rate for clock in clocks.values())
+    last = min(periods, max_frames or periods) - 1
+    steady = {}
+    for name, clock in clocks.items():
+        whole = max(1.0, np.rint(clock.rate))
+        is_steady = abs(whole - clock.rate) * last < _NEAR
+        steady[name] = replace(clock, rate=whole) if is_steady else clock
+    return steady
 
 
-def _common_timestamps(
-    path: Path,
-    readers: Mapping[str, FrameReader],
-    config: ReadConfig,
-    clocks: _Clocks,
-) -> np.ndarray:
+def _common_timestamps(path: Path, clocks: _Clocks, config: ReadConfig, fps: float) -> np.ndarray:
     """Return the timestamps that all clips cover [T]."""
     # A truncated clip can be trimmed but not shifted.
-    is_held = config.trim and not config.gaps
-    clips = readers.values()
     if not (config.gaps or config.trim):
-        for reader in clips:
-            _check_complete(reader, reader.num_frames)
-    lengths = np.array(
-        [r.num_held if is_held and r.positions is None else _periods(r) for r in clips]
-    )
-    first = np.ceil(np.max(-clocks.offsets / clocks.rates))
-    last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
+        for clock in clocks.values():
+            _check_complete(clock.reader, clock.reader.num_frames)
+    first = np.ceil(max(clock.timestamp(0) for clock in clocks.values()))
+    last = np.floor(min(clock.timestamp(clock.length - 1) for clock in clocks.values()))
     if last < first:
-        spans = np.stack([0 * lengths, lengths], axis=1) - clocks.offsets[:, None]
-        spans = spans / (clocks.rates * clocks.fps)[:, None]
         table = ", ".join(
-            f"{name} {start:.2f} to {stop:.2f} s"
-            for name, (start, stop) in zip(readers, spans, strict=True)
+            f"{name} {clock.timestamp(0) / fps:.2f} to {clock.timestamp(clock.length) / fps:.2f} s"
+            for name, clock in clocks.items()
         )
         raise ValueError(f"{path}: the clips have no timestamp in common, {table}; check `offset`.")
     return np.arange(first, last + 1)
@@ -358,13 +348,6 @@ def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
     return np.searchsorted((reader.positions[1:] + reader.positions[:-1]) / 2, positions)
 
 
-def _periods(reader: FrameReader) -> int:
-    """Return the number of positions that a clip covers: its number of frames if their rate is
-    constant.
-    """
-    return reader.num_frames if reader.positions is None else round(reader.positions[-1]) + 1
-
-
 def _check_complete(reader: FrameReader, required: int) -> None:
     """Check that the first `required` frames of a clip can be read."""
     if required > reader.num_held:
@@ -375,17 +358,18 @@ def _check_complete(reader: FrameReader, required: int) -> None:
         )
 
 
-def _num_frames(
-    path: Path, readers: Sequence[FrameReader], max_frames: int | None, gaps: bool
-) -> int:
+def _num_frames(path: Path, clocks: _Clocks, max_frames: int | None, gaps: bool) -> int:
     """Return the number of timestamps of clips that are not aligned."""
     if gaps:
-        longest = max(map(_periods, readers))
+        longest = max(clock.length for clock in clocks.values())
         return min(longest, max_frames or longest)
-    lengths = [min(reader.num_frames, max_frames or reader.num_frames) for reader in readers]
-    for reader, required in zip(readers, lengths, strict=True):
+    lengths = []
+    for clock in clocks.values():
+        reader = clock.reader
+        required = min(reader.num_frames, max_frames or reader.num_frames)
+        lengths.append(required)
         _check_complete(reader, required)
-        if reader.positions is None or not reader.fps:
+        if reader.positions is None:
             continue
         # Frame t must show timestamp t.
         late = reader.positions[:required] - np.arange(required)
@@ -396,15 +380,15 @@ def _num_frames(
                 f"{1e3 * late[frame] / reader.fps:.0f} ms late; use the frames nearest in time "
                 "(--trim), leave the camera out where it has none (--gaps), or convert the clip."
             )
-    shortest = min(lengths)
-    if max(lengths) > shortest:
+    if max(lengths) > min(lengths):
+        readers = [clock.reader for clock in clocks.values()]
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "
-            f"with `max_frames={shortest}`, those that all clips cover with --trim, align the "
+            f"with `max_frames={min(lengths)}`, those that all clips cover with --trim, align the "
             "clips with --offset, or leave cameras out with --exclude."
         )
-    return shortest
+    return min(lengths)
 
 
 def read_settings(path: Path) -> dict[str, Any]:

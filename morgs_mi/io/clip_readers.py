@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +18,9 @@ Clip = Path | tuple[Path, ...]
 
 
 def open_clips(
-    clips: Sequence[Clip], gaps: bool = False, white: int | None = None
-) -> list[FrameReader]:
-    """Return one reader per camera; with `gaps`, images may be missing or broken.
+    clips: Mapping[str, Clip], gaps: bool = False, white: int | None = None
+) -> dict[str, FrameReader]:
+    """Return the readers of the clips of cameras; with `gaps`, images may be missing or broken.
 
     Folders are then aligned by the numbers of their images: a number that only others have is a
     missing image.
@@ -29,7 +29,7 @@ def open_clips(
     or 12 bits may have written them.
 
     Args:
-        clips: one per camera.
+        clips: by the names of the cameras.
         gaps: whether images may be missing.
         white: value of white in images of 16 bits; None: the largest.
 
@@ -38,22 +38,22 @@ def open_clips(
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
     folders = aligned_folders(
-        [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
+        [clip for clip in clips.values() if gaps and isinstance(clip, Path) and clip.is_dir()]
     )
-    readers = [folders[clip] if clip in folders else open_frames(clip, gaps) for clip in clips]
+    readers = {name: folders.get(clip) or open_frames(clip, gaps) for name, clip in clips.items()}
     largest = max(
-        (reader.most or 0 for reader in readers if reader.most is not None), default=WHITE
+        (reader.most for reader in readers.values() if reader.most is not None), default=WHITE
     )
     if white is None and largest < WHITE // 4:
         _LOG.warning(
             "%s and the other cameras: the first images have 16 bits but no value above %d and are "
             "nearly black; if white is less than %d, such as 4095 of cameras with 12 bits, set "
             '"white": 4095 in capture.json.',
-            readers[0].path,
+            next(iter(readers.values())).path,
             largest,
             WHITE,
         )
-    return [replace(reader, white=white or WHITE) for reader in readers]
+    return {name: replace(reader, white=white or WHITE) for name, reader in readers.items()}
 
 
 def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:

@@ -32,11 +32,11 @@ def write_camera(path, kind, values):
 def test_open_clips__names_dark_images_of_16_bits_without_a_white(
     tmp_path, caplog, kind, most, white, shown, note
 ):
-    clips = [tmp_path / f"{camera}.mkv" for camera in range(len(most))]
-    for clip, value in zip(clips, most, strict=True):
+    clips = {camera: tmp_path / f"{camera}.mkv" for camera in range(len(most))}
+    for clip, value in zip(clips.values(), most, strict=True):
         write_camera(clip, kind, [value])
     readers = open_clips(clips, white=white)
-    assert [next(reader.frames())[0, 0, 0] for reader in readers] == shown
+    assert [next(reader.frames())[0, 0, 0] for reader in readers.values()] == shown
     assert note in caplog.text
     assert bool(note) == bool(caplog.text)
 
@@ -44,7 +44,7 @@ def test_open_clips__names_dark_images_of_16_bits_without_a_white(
 @pytest.mark.parametrize("kind", ["images", "video"])
 def test_open_clips__refuses_values_above_white(tmp_path, kind):
     write_camera(tmp_path / "a.mkv", kind, [4095, 5000])
-    (reader,) = open_clips([tmp_path / "a.mkv"], white=4095)
+    reader = open_clips({"a": tmp_path / "a.mkv"}, white=4095)["a"]
     with pytest.raises(ValueError, match=r"expected values up to the `white` .* 4095, got 5000"):
         list(reader.frames())
 
@@ -53,4 +53,4 @@ def test_open_clips__refuses_values_above_white(tmp_path, kind):
 def test_open_clips__refuses_images_that_have_neither_8_nor_16_bits(tmp_path, dtype):
     cv2.imwrite(str(tmp_path / "0.tif"), np.full((32, 48, 3), 9, dtype))
     with pytest.raises(ValueError, match=r"0\.tif: expected 8 or 16 bits"):
-        open_clips([tmp_path])
+        open_clips({"a": tmp_path})

@@ -57,7 +57,7 @@ def recording(**changes):
     views = look_at_cameras([(x, 0, -3) for x in (-1, 0, 1)], 60, 32, 24)
     fields = {
         "path": Path("noise"),
-        "views": Views(RecordedView(view, source=None) for view in views),
+        "views": Views(RecordedView(view, reader=None, times=None) for view in views),
         "num_frames": FRAMES,
         "fps": 25.0,
         "points": rng.uniform(-1, 1, (150, 3)).astype(np.float32),

@@ -314,8 +314,7 @@ def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tupl
             f"{', '.join(names) or 'none'}; check the path, or make {EXAMPLE}"
         )
     white = read_settings(path / CAPTURE).get("white")
-    readers = open_clips([clips[name] for name in names], white=white)
-    readers = dict(zip(names, readers, strict=True))
+    readers = open_clips({name: clips[name] for name in names}, white=white)
     # The last timestamp of each clip, in frames of a constant rate.
     last_frames = {
         name: reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])

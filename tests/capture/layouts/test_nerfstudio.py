@@ -97,7 +97,7 @@ def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path):
     )
     full = load_capture(path)
     small = load_capture(path, 2)
-    alone = full.views[0].source.undistortion.mask
+    alone = full.views[0].undistortion.mask
     for mask in full.masks:
         assert not mask[:, : WIDTH // 2 - 2].any()
         assert not (mask & ~alone).any()
