@@ -74,6 +74,28 @@ class PartialFrame:
     #: Whether an image is missing that the recording should have.
     unread: bool = False
 
+    @classmethod
+    def of(
+        cls,
+        index: int,
+        views: Views[Any],
+        images: Sequence[ImageOrError],
+        before: PartialFrame | None = None,
+    ) -> PartialFrame:
+        """Return the frame of the images of all views, or of errors in place of missing ones.
+
+        A warning names each view without an image that has one in the frame `before`.
+        """
+        problems = []
+        present = []
+        for k, (view, image) in enumerate(zip(views, images, strict=True)):
+            present.append(None if isinstance(image, Exception) else image)
+            if isinstance(image, Exception):
+                problems.append(f"{view.name}: {image}")
+                if before is None or before.views[k].has_image:
+                    _LOG.warning("frame %d: %s is left out: %s", index, view.name, image)
+        return cls(index, views.at(present), tuple(problems))
+
     @property
     def images(self) -> tuple[np.ndarray | None, ...]:
         """Per camera [H, W, 3], RGB, or None for a missing image."""
@@ -287,27 +309,20 @@ class Capture:
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
         streams = [view.images(start, stop) for view in self.views]
-        missing: set[str] = set()
+        frame = None
         try:
-            for index, results in enumerate(zip(*streams, strict=True), start=start):
-                pairs = zip(self.names, results, strict=True)
-                errors = {name: f for name, f in pairs if isinstance(f, Exception)}
+            for index, images in enumerate(zip(*streams, strict=True), start=start):
+                errors = [image for image in images if isinstance(image, Exception)]
                 if strict and errors:
-                    raise next(iter(errors.values()))
-                for name in errors.keys() - missing:
-                    _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
-                missing = set(errors)
-                # With gaps, timestamps without an image are part of the recording.
-                unread = bool(errors) and not (
-                    self.reading.gaps and os.path.exists(self.views[0].reader.path)
-                )
-                recorded = self.views.at([None if isinstance(f, Exception) else f for f in results])
-                # The motion in the first frame is unknown, so delays cannot be rendered.
-                views = recorded
+                    raise errors[0]
+                frame = PartialFrame.of(index, self.views, images, frame)
                 if index == 0:
-                    views = Views(map(RecordedView.at_first_timestamp, self.views, recorded))
-                problems = tuple(f"{name}: {error}" for name, error in errors.items())
-                yield PartialFrame(index, views, problems, recorded, unread)
+                    # The motion in the first frame is unknown, so delays cannot be rendered.
+                    first = map(RecordedView.at_first_timestamp, self.views, frame.views)
+                    frame = replace(frame, views=Views(first), recorded=frame.views)
+                # With gaps, timestamps without an image are part of the recording.
+                has_gaps = self.reading.gaps and os.path.exists(self.views[0].reader.path)
+                yield replace(frame, unread=bool(errors) and not has_gaps)
         finally:
             for stream in streams:
                 stream.close()

@@ -37,10 +37,9 @@ class Shot:
 class FrameSet:
     """Images of the cameras at about one time."""
 
-    #: Per camera uint8 [H, W, 3], RGB, None where it has none.
-    images: tuple[np.ndarray | None, ...]
+    images: Mapping[str, np.ndarray]  #: Of each camera that has one, uint8 [H, W, 3], RGB.
     #: Per camera the number of its image, or of its newest one before where it has none.
-    numbers: tuple[int, ...]
+    numbers: Mapping[str, int]
     time: float  #: At which the last of the images arrived, s of `time.monotonic`.
     skew: float  #: Largest difference in time between two of the images, s.
     #: Number of images that each camera delivered after the frame set before and that are in none.
@@ -71,17 +70,17 @@ class CameraFeed:
         closed: Event | None = None,
         ended: str = "it has ended",
     ) -> None:
-        self.names = tuple(cameras)
         self._timeout = timeout
         self._warm_up = warm_up
         self._change = Condition()
         self._stop_event = closed or Event()
-        self._cameras = [
-            _Camera(images, self._change, self._stop_event, ended) for images in cameras.values()
-        ]
+        self._cameras = {
+            name: _Camera(images, self._change, self._stop_event, ended)
+            for name, images in cameras.items()
+        }
         # A thread that executes library code when the interpreter ends aborts the process.
         atexit.register(self.close)
-        for camera in self._cameras:
+        for camera in self._cameras.values():
             camera.start()
 
     def newest(self, after: FrameSet | None = None) -> FrameSet | None:
@@ -101,7 +100,7 @@ class CameraFeed:
             deadline = time.monotonic() + self._timeout
             while True:
                 time_left = deadline - time.monotonic()
-                is_running = any(camera.reason is None for camera in self._cameras)
+                is_running = any(camera.reason is None for camera in self._cameras.values())
                 frame_set = self._frame_set(after, is_running, late=time_left <= 0)
                 if frame_set is not None:
                     return frame_set
@@ -111,21 +110,21 @@ class CameraFeed:
                     require(
                         after,
                         "CameraFeed()",
-                        f"expected simultaneous images of {', '.join(self.names)}",
+                        f"expected simultaneous images of {', '.join(self._cameras)}",
                         f"none that arrived within {_MAX_SKEW:g} s of each other",
                         "start the cameras together",
                     )
                     return None
 
-    def problem(self, camera: int) -> str:
-        """Return why a camera has no image in the last frame set."""
+    def problem(self, camera: str) -> str:
+        """Return why a camera has no image in the last frame set, by its name."""
         return self._cameras[camera].reason or f"no image for {self._timeout:g} s"
 
     def ended(self) -> str:
         """Return why no camera delivers images any more."""
         names: dict[str, list[str]] = {}
-        for k, name in enumerate(self.names):
-            names.setdefault(self.problem(k), []).append(name)
+        for name in self._cameras:
+            names.setdefault(self.problem(name), []).append(name)
         return "; ".join(f"{', '.join(those)}: {problem}" for problem, those in names.items())
 
     def close(self) -> None:
@@ -133,52 +132,49 @@ class CameraFeed:
         atexit.unregister(self.close)
         self._stop_event.set()
         deadline = time.monotonic() + _CLOSING
-        for camera in self._cameras:
+        for camera in self._cameras.values():
             camera.join(max(0.0, deadline - time.monotonic()))
 
     def _frame_set(self, after: FrameSet | None, is_running: bool, late: bool) -> FrameSet | None:
         """Return the frame set of the images that are there; None as long as an expected one is
         missing.
         """
-        numbers = [-1] * len(self._cameras) if after is None else after.numbers
-        new = [
-            [shot for shot in camera.shots if shot.number > number]
-            for camera, number in zip(self._cameras, numbers, strict=True)
-        ]
-        # The first images have to be complete, and so have the last ones. Otherwise a camera that
-        # runs is waited for, unless it is late or was missing before; an image of another has to be
-        # of the time of the newest.
-        last = max((shots[-1].time for shots in new if shots), default=0.0)
-        recent = [bool(shots) and last - shots[-1].time <= _MAX_SKEW for shots in new]
-        expected = [after is None or after.images[k] is not None for k in range(len(new))]
-        if after is not None and is_running:
-            for k, camera in enumerate(self._cameras):
-                is_awaited = not late and camera.reason is None
-                expected[k] = expected[k] or bool(new[k]) if is_awaited else recent[k]
-        groups = [shots for shots, is_expected in zip(new, expected, strict=True) if is_expected]
-        if not groups or not all(groups):
+        numbers = dict.fromkeys(self._cameras, -1) if after is None else after.numbers
+        had_image = self._cameras.keys() if after is None else after.images.keys()
+        new = {
+            name: [shot for shot in camera.shots if shot.number > numbers[name]]
+            for name, camera in self._cameras.items()
+        }
+        newest = max((shots[-1].time for shots in new.values() if shots), default=0.0)
+        groups = {}
+        for name, camera in self._cameras.items():
+            # The first images have to be complete, and so have the last ones. Otherwise a camera
+            # that runs is waited for, unless it is late or was missing before.
+            is_awaited = after is None or not is_running or not (late or camera.reason)
+            is_recent = bool(new[name]) and newest - new[name][-1].time <= _MAX_SKEW
+            if is_recent or (is_awaited and name in had_image):
+                groups[name] = new[name]
+        if not groups or not all(groups.values()):
             return None
-        time_of_slowest = min(shots[-1].time for shots in groups)
-        shots = [
-            min(shots, key=lambda shot: abs(shot.time - time_of_slowest)) if is_expected else None
-            for shots, is_expected in zip(new, expected, strict=True)
-        ]
-        times = [shot.time for shot in shots if shot is not None]
+        time_of_slowest = min(shots[-1].time for shots in groups.values())
+        chosen = {
+            name: min(shots, key=lambda shot: abs(shot.time - time_of_slowest))
+            for name, shots in groups.items()
+        }
+        times = [shot.time for shot in chosen.values()]
         skew = max(times) - min(times)
         if skew > _MAX_SKEW:
             return None
-        pairs = zip(shots, self._cameras, strict=True)
-        skipped = [
-            shot.number - number - 1
-            for shot, number in zip(shots, numbers, strict=True)
-            if shot is not None
-        ]
+        skipped = min(shot.number - numbers[name] - 1 for name, shot in chosen.items())
         return FrameSet(
-            tuple(shot and shot.image for shot in shots),
-            tuple((shot or camera.shots[-1]).number for shot, camera in pairs),
+            {name: shot.image for name, shot in chosen.items()},
+            {
+                name: chosen.get(name, camera.shots[-1]).number
+                for name, camera in self._cameras.items()
+            },
             max(times),
             skew,
-            0 if after is None else min(skipped),
+            0 if after is None else skipped,
         )
 
     def _wait_for_first(self) -> None:
@@ -188,16 +184,16 @@ class CameraFeed:
             OSError, ValueError: one has none.
         """
         deadline = time.monotonic() + self._timeout
-        while silent := [k for k, camera in enumerate(self._cameras) if not camera.shots]:
+        cameras = self._cameras.items()
+        while silent := {name: camera for name, camera in cameras if not camera.shots}:
             time_left = deadline - time.monotonic()
-            for k in silent:
-                camera = self._cameras[k]
+            for name, camera in silent.items():
                 if camera.error is not None:
                     raise camera.error
                 require(
                     camera.reason is None and time_left > 0,
                     "CameraFeed()",
-                    f"expected images of {self.names[k]}",
+                    f"expected images of {name}",
                     f"none ({camera.reason or 'it is silent'})",
                     "check that it records, or wait for it longer than "
                     f"{self._timeout:g} s (--timeout)",
@@ -206,7 +202,7 @@ class CameraFeed:
         # The warm-up, unless a camera ends.
         end = time.monotonic() + self._warm_up
         while (time_left := end - time.monotonic()) > 0 and all(
-            camera.reason is None for camera in self._cameras
+            camera.reason is None for camera in self._cameras.values()
         ):
             self._change.wait(time_left)
 

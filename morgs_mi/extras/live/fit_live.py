@@ -11,9 +11,9 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import count
 from math import inf
@@ -25,10 +25,12 @@ from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.reader_registry import find_reader
+from morgs_mi.capture.recorded_view import RecordedView
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.extras.live.cameras import CameraFeed, FrameSet
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.extras.live.sources import Source, open_feed
+from morgs_mi.io.images import ImageOrError
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.platform.config import config_or_default
@@ -128,15 +130,14 @@ def fit_live(
         if first is None:
             raise ValueError("fit_live(): expected images of the cameras, got none.")
         report("Waiting for the cameras", 1, 1)
-        capture = begin_capture(folder, feed.names, first.images, live, calibration, on_stage)
+        capture = begin_capture(folder, first.images, live, calibration, on_stage)
         frames = _LiveFrames(feed, capture, first, live)
         return _fit(frames, out, config, on_frame, report)
 
 
 def begin_capture(
     folder: Path,
-    names: Sequence[str],
-    images: Sequence[np.ndarray | None],
+    images: Mapping[str, np.ndarray],
     config: LiveConfig,
     calibration: Calibration | None = None,
     on_stage: Report | None = None,
@@ -146,8 +147,7 @@ def begin_capture(
 
     Args:
         folder: is made, and must not exist.
-        names: names of the cameras.
-        images: one per camera, uint8 [H, W, 3], RGB.
+        images: one per camera, by its name, uint8 [H, W, 3], RGB.
         config: settings.
         calibration: of the cameras; None: they are calibrated by the images.
         on_stage: called with (name, done, total) of the calibration.
@@ -158,7 +158,7 @@ def begin_capture(
             sizes.
     """
     try:
-        write_images(folder, names, images, 0)
+        write_images(folder, images, 0)
         write_json(folder / CAPTURE, {"fps": config.fps})
         if calibration is not None:
             write_colmap(
@@ -189,24 +189,20 @@ def begin_capture(
         raise
 
 
-def write_images(
-    folder: Path, names: Sequence[str], images: Sequence[np.ndarray | None], frame: int
-) -> None:
-    """Write the images of a frame into a capture, side by side.
+def write_images(folder: Path, images: Mapping[str, np.ndarray], frame: int) -> None:
+    """Write the images of a frame into a capture, by the names of the cameras, side by side.
 
     Raises:
         OSError: the disk is full or not writable.
     """
 
-    def write(view: int) -> None:
-        image = images[view]
-        if image is not None:
-            file = folder / names[view] / f"{frame:04d}.png"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(file, "fit_live()") as partial:
-                partial.write_bytes(png_bytes(image))
+    def write(name: str) -> None:
+        file = folder / name / f"{frame:04d}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(file, "fit_live()") as partial:
+            partial.write_bytes(png_bytes(images[name]))
 
-    map_in_threads(write, range(len(names)))
+    map_in_threads(write, [*images])
 
 
 @dataclass
@@ -217,48 +213,35 @@ class _LiveFrames:
     capture: Capture  # capture of their first images
     first: FrameSet  # these images
     config: LiveConfig
-    missing_names: set[str] = field(default_factory=set)  # cameras without an image before
 
     def __iter__(self) -> Iterator[tuple[FrameSet, PartialFrame]]:
         """Yield whenever the next frame is asked for the newest images, as recorded and as
         processed.
         """
         frame_set = self.first
+        frame = None
         end = inf
-        for frame in count():
-            yield frame_set, self._processed(frame_set, frame)
+        for index in count():
+            images = map_in_threads(partial(self._processed, frame_set), self.capture.views)
+            frame = PartialFrame.of(index, self.capture.views, images, frame)
+            yield frame_set, frame
             end = min(end, time.monotonic() + (self.config.seconds or inf))
-            if frame + 1 == self.config.frames:
+            if index + 1 == self.config.frames:
                 return
             if (frame_set := self.feed.newest(frame_set)) is None:
-                _LOG.warning("the fit ends after frame %d: %s", frame, self.feed.ended())
+                _LOG.warning("the fit ends after frame %d: %s", index, self.feed.ended())
             if frame_set is None or frame_set.time > end:
                 return
 
-    def _processed(self, frame_set: FrameSet, frame: int) -> PartialFrame:
-        """Return the processed images of a frame set; a camera that has none, or none of its size,
-        is logged once.
-        """
-        views = self.capture.views
-        problems: dict[str, str] = {}
-        for k, (view, image) in enumerate(zip(views, frame_set.images, strict=True)):
-            if image is None:
-                problems[view.name] = self.feed.problem(k)
-            elif (size := image.shape[1::-1]) != view.recorded_size:
-                sizes = (*view.recorded_size, *size)
-                problems[view.name] = "expected an image of {}x{}, got {}x{}".format(*sizes)
-        for name in problems.keys() - self.missing_names:
-            _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
-        self.missing_names = set(problems)
-
-        def process(k: int) -> np.ndarray | None:
-            image = frame_set.images[k]
-            view = views[k]
-            return None if image is None or view.name in problems else view.process(image)
-
-        images = map_in_threads(process, range(len(views)))
-        sentences = tuple(f"{name}: {problem}" for name, problem in problems.items())
-        return PartialFrame(frame, views.at(images), sentences)
+    def _processed(self, frame_set: FrameSet, view: RecordedView) -> ImageOrError:
+        """Return the processed image of a view, or an error if it has none of its size."""
+        image = frame_set.images.get(view.name)
+        if image is None:
+            return ValueError(self.feed.problem(view.name).rstrip("."))
+        if (size := image.shape[1::-1]) != view.recorded_size:
+            sizes = (*view.recorded_size, *size)
+            return ValueError("expected an image of {}x{}, got {}x{}".format(*sizes))
+        return view.process(image)
 
 
 def _fit(
@@ -316,8 +299,5 @@ def _fit(
 def _record(frames: _LiveFrames, out: Path, frame_set: FrameSet, frame: PartialFrame) -> None:
     """Write the recorded images of a frame into the capture, which has the first frame's."""
     if frames.config.record and frame.index:
-        images = [
-            None if result is None else image
-            for image, result in zip(frame_set.images, frame.images, strict=True)
-        ]
-        write_images(out / "capture", frames.capture.names, images, frame.index)
+        names = [view.name for view in frame.views if view.has_image]
+        write_images(out / "capture", {n: frame_set.images[n] for n in names}, frame.index)

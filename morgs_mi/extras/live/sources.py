@@ -24,6 +24,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, PartialFrame, RecordedView
 from morgs_mi.extras.live.cameras import CameraFeed
 from morgs_mi.extras.live.live_config import LiveConfig
+from morgs_mi.io.images import ImageOrError
 from morgs_mi.io.prefetch import close_items, prefetched
 from morgs_mi.io.video import VideoReader
 from morgs_mi.platform.checks import quantity, require
@@ -31,10 +32,7 @@ from morgs_mi.platform.checks import quantity, require
 Source = int | str | Path
 """A camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens."""
 
-# Reads that may fail in succession before a source counts as ended, and the pause after each, s.
-_FAILURES = 10
-PAUSE = 0.02
-RETRY = 1.0  # pause before a connection is opened again, s
+RETRY = 1.0  # pause before a source is opened again, s
 # Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few
 # seconds.
 _SILENCE = 10.0
@@ -122,14 +120,14 @@ def live_frames(
         if is_video(source):
             streams.append(play(source, ClipClock(), stop))
         elif isinstance(source, Source):
-            # Reconnecting would make the other cameras wait for it.
-            streams.append(read_camera(source, stop, reconnect=False))
+            # Opening it again would make the other cameras wait for it.
+            streams.append(read_once(source, stop))
         else:
             streams.append(iter(source))
 
-    def process(view: RecordedView, image: np.ndarray | None) -> np.ndarray | None:
+    def process(view: RecordedView, image: np.ndarray | None) -> ImageOrError:
         if image is None:
-            return None
+            return ValueError("no image")
         width, height = view.recorded_size
         require(
             image.shape == (height, width, 3) and image.dtype == np.uint8,
@@ -141,17 +139,14 @@ def live_frames(
         return view.process(image)
 
     def frames() -> Iterator[PartialFrame]:
+        frame = None
         try:
             for index in count():
                 images = [next(stream, None) for stream in streams]
                 if all(image is None for image in images):
                     return
-                pairs = list(zip(rig.names, images, strict=True))
-                yield PartialFrame(
-                    index,
-                    rig.views.at(list(map(process, rig.views, images))),
-                    tuple(f"{name}: no image" for name, image in pairs if image is None),
-                )
+                frame = PartialFrame.of(index, rig.views, [*map(process, rig.views, images)], frame)
+                yield frame
         finally:
             for stream in streams:
                 close_items(stream)
@@ -160,59 +155,48 @@ def live_frames(
 
 
 def read_camera(
-    source: Source,
-    closed: Event,
-    size: tuple[int, int] | None = None,
-    reconnect: bool = True,
+    source: Source, closed: Event, size: tuple[int, int] | None = None
 ) -> Iterator[np.ndarray | None]:
-    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has
-    failed.
+    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, until `closed` is set. A
+    source that ends or fails is opened again, with None for every attempt.
 
     Args:
         source: a camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens.
         closed: is set by another thread to end the images.
         size: width and height that are requested of a camera of this machine.
-        reconnect: whether a connection that breaks is opened again.
 
     Raises:
-        OSError: the source cannot be opened.
+        OSError: the source cannot be opened at first.
     """
-    yield from _until_end(source, closed, size)
-    while reconnect and "://" in str(source) and not closed.wait(RETRY):
+    yield from read_once(source, closed, size)
+    while not closed.wait(RETRY):
         yield None
         with suppress(OSError):
-            yield from _until_end(source, closed, size)
+            yield from read_once(source, closed, size)
 
 
-def _until_end(
-    source: Source, stop: Event, size: tuple[int, int] | None
-) -> Iterator[np.ndarray | None]:
-    """Yield the images of a source, which is opened once, until several reads in succession have
-    failed; see `read_camera`.
-    """
-    if stop.is_set():
-        return
+def read_once(
+    source: Source, closed: Event, size: tuple[int, int] | None = None
+) -> Iterator[np.ndarray]:
+    """Yield the images of a source, which is opened once, until a read fails; see `read_camera`."""
     if isinstance(source, int):
         stream = cv2.VideoCapture(source)
     else:
         # A connection is waited for only so long.
         limit = int(1000 * _SILENCE)
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
-        place = str(source)
-        stream = cv2.VideoCapture(place, cv2.CAP_FFMPEG, limits if "://" in place else [])
+        stream = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, limits)
     if not stream.isOpened():
         raise OSError(f"cannot open the source {source}; check that it exists and is not in use.")
     if isinstance(source, int) and size is not None:
         stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-    failures = 0
     try:
-        while failures < _FAILURES and not stop.is_set():
+        while not closed.is_set():
             is_read, image = stream.read()
-            failures = 0 if is_read else failures + 1
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
             if not is_read:
-                stop.wait(PAUSE)
+                return
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     finally:
         stream.release()
 

@@ -123,8 +123,8 @@ def test_open_feed__of_videos_begins_with_their_first_images(tmp_path, loop):
     )
     try:
         frame_set = first = feed.newest()
-        assert max(first.numbers) < 8, "without a time to adjust the exposure"
-        while frame_set is not None and frame_set.numbers[0] < 25:
+        assert max(first.numbers.values()) < 8, "without a time to adjust the exposure"
+        while frame_set is not None and frame_set.numbers["cam0"] < 25:
             frame_set = feed.newest(frame_set)
         assert (frame_set is None) != loop
         if frame_set is None:
