@@ -353,7 +353,7 @@ def _check_complete(reader: FrameReader, required: int) -> None:
     if required > reader.num_held:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the "
-            "file is truncated or broken; copy it again, use the frames before it (`max_frames`), "
+            "file is truncated or broken; copy it again, use the frames before it (--frames), "
             "or leave its camera out, of the later frames (--gaps) or of all (--exclude)."
         )
 
@@ -385,7 +385,7 @@ def _num_frames(path: Path, clocks: _Clocks, max_frames: int | None, gaps: bool)
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "
-            f"with `max_frames={min(lengths)}`, those that all clips cover with --trim, align the "
+            f"with --frames {min(lengths)}, those that all clips cover with --trim, align the "
             "clips with --offset, or leave cameras out with --exclude."
         )
     return min(lengths)

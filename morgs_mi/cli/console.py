@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-import re
 import shlex
 import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -126,11 +125,9 @@ class LogHandler(logging.Handler):
         print_warning(f"{record.levelname.capitalize()}: {record.getMessage()}")
 
 
-def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "") -> str:
-    """Return the message of an error in one line, with the options `names`, and without the number
-    of a system error.
-
-    Arguments are those of `with_option_names`.
+def sentence_of(error: BaseException) -> str:
+    """Return the message of an error in one line, without the number of a system error and the
+    Python function that a user did not call.
     """
     message = str(error)
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
@@ -138,46 +135,16 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
         message = f"{file}{error.strerror.rstrip('.')}."
     if isinstance(error, MemoryError) and not message:
         message = "Out of memory; process smaller images, or fewer frames or Gaussians."
-    text = with_option_names(" ".join(message.split()), names, place)
+    text = " ".join(message.split())
+    function, _, sentence = text.partition("(): ")
+    if sentence and function.replace(".", "_").isidentifier():
+        text = sentence
     if not isinstance(error, _EXPECTED):
         return (
             f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug "
             "for the traceback."
         )
-    if isinstance(error, OSError):  # it is about a file; the function is of no use to a user
-        text = re.sub(r"^cannot", "Cannot", re.sub(r"^[\w.]+\(\): ", "", text))
     return text or f"{type(error).__name__}."
-
-
-def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") -> str:
-    """Return an error message with command-line options in place of Python arguments.
-
-    ``load_capture(): `downscale` must be ...`` becomes ``--downscale must be ...``, and
-    ```max_frames=3``` becomes ``--frames 3``. A message is changed only if it starts with a
-    function or with a file of `place` and names one of the arguments; in a JSON or TOML file the
-    same name is a key.
-
-    Args:
-        sentence: the message.
-        names: options by argument name.
-        place: a path from the command line that a message may start with; it stays.
-    """
-    # A function, or the place: itself, or a file in it that has no such keys.
-    function = r"[\w.]+\(\): "
-    file = rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): " if place else function
-    start = re.match(f"{function}|{file}", sentence)
-    if start is None:
-        return sentence
-
-    def option(match: re.Match[str]) -> str:
-        name, value = match.groups()
-        return f"{names[name]} {value or ''}".rstrip() if name in names else match[0]
-
-    text = sentence[start.end() :]
-    new_text = re.sub(r"`([\w.]+)(?:=(\w+))?`", option, text)
-    if re.match(function, start[0]) and new_text != text:
-        return new_text
-    return start[0] + new_text
 
 
 @contextmanager

@@ -77,10 +77,6 @@ class Fit:
         "later frames": ("epochs", "flow", "masks"),
         "output": ("quality", "target-size", "resume"),
     }
-    arguments: ClassVar[Mapping[str, str]] = {
-        "max_frames": "--frames",
-        "test_view": "--hold-out",
-    }
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture

@@ -18,7 +18,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import version
@@ -44,7 +43,6 @@ from morgs_mi.cli.fit import Fit
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import (
     Flag,
-    Settings,
     fill_help,
     one_command,
     options,
@@ -121,7 +119,6 @@ def main(args: Sequence[str] | None = None) -> int:
 def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None) -> int:
     """Parse `args` into options with a `command`, run the command, and return the exit status."""
     args = sys.argv[1:] if args is None else list(args)
-    command: Any = None
     # A character that the encoding does not have is printed as a code.
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -146,21 +143,16 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             print_warning(f"{prog}: {mistake}")
             return _REJECTED
         options: Any = _help(parse, args) if {"-h", "--help"} & {*args} else parse()
-        command = options.command
         _set_up(options)
         with interruptible():
-            command.run()
+            options.command.run()
             _flush_output()
         return 0
     except (KeyboardInterrupt, Exception) as error:
         if isinstance(error, BrokenPipeError) and error.filename == STDOUT:
             _drop_output()
             return _CLOSED
-        sentence = "Interrupted."
-        if not is_interruption(error):
-            sentence = sentence_of(
-                error, _option_names(command), str(getattr(command, "capture", None) or "")
-            )
+        sentence = "Interrupted." if is_interruption(error) else sentence_of(error)
         # In the notes of an error, `--resume` is the command line that continues.
         resume = [] if "--resume" in args else ["--resume"]
         command_line = shlex.join([prog, *args, *resume])
@@ -236,19 +228,6 @@ def _drop_output() -> None:
     except OSError:
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _option_names(command: Any) -> dict[str, str]:
-    """Return the options of a command by the Python arguments that they set."""
-    if isinstance(command, Settings):
-        return command.option_names()
-    names: dict[str, str] = {}
-    for field in fields(command) if is_dataclass(command) else ():
-        if is_dataclass(value := getattr(command, field.name)):
-            names |= _option_names(value)
-        elif "Positional" not in str(field.type):
-            names[field.name] = f"--{field.name.replace('_', '-')}"
-    return names | getattr(command, "arguments", {})
 
 
 def _set_up(options: Common) -> None:

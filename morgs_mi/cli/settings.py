@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import (
     Annotated,
     Any,
-    ClassVar,
     Literal,
     TypeVar,
     dataclass_transform,
@@ -183,8 +182,6 @@ class Reading:
     near: Annotated[float | None, optional("UNITS", "(default: from the scene)")] = None
     """Depth of the cameras' near planes (docs/captures.md)."""
 
-    arguments: ClassVar[Mapping[str, str]] = {"without": "--exclude"}
-
     def read_config(self) -> ReadConfig:
         """Return the options as `load_capture` takes them."""
         values = asdict(self)
@@ -240,16 +237,6 @@ class Settings:
         """Return the settings that were given as options, by key."""
         values = {key: getattr(self, option) for option, key in SETTINGS.items()}
         return {key: value for key, value in values.items() if value is not None}
-
-    def option_names(self) -> dict[str, str]:
-        """Return the options that were given, by their settings' keys and names."""
-        values = self.given()
-        options = {
-            key: f"--{option.replace('_', '-')}"
-            for option, key in SETTINGS.items()
-            if key in values
-        }
-        return options | {key.rpartition(".")[2]: option for key, option in options.items()}
 
     def stream_config(self, base: StreamConfig | None = None) -> StreamConfig:
         """Return `base`, by default the default config, with the preset, the file and the given

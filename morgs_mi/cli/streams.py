@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -151,7 +151,6 @@ class ExportKind:
 
     formats: ClassVar[tuple[Format, ...]]
     drawn: ClassVar[bool] = False
-    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self, stream: FrameSource) -> None:
         options = vars(self)

@@ -148,7 +148,7 @@ class VideoReader(Frames):
                         if missing >= self.num_frames
                         else f"{self.path}: frame {missing} of {self.num_frames} cannot be "
                         "decoded: the file is truncated or broken; copy it again or use the first "
-                        f"{missing} frames (`max_frames`)."
+                        f"{missing} frames (--frames)."
                     )
                     continue
                 try:

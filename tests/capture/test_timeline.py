@@ -236,7 +236,7 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path):
 
 def test_timeline__refuses_clips_of_different_lengths(tmp_path):
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 25)})
-    message = r"number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* --offset"
+    message = r"number of frames, got a.mkv 4, b.mkv 6; .*--frames 4, .* --trim, .* --offset"
     with pytest.raises(ValueError, match=message):
         load_capture(path)
 

@@ -1,6 +1,4 @@
-"""Console output: progress and tables without a terminal, and error messages in the words of the
-command line.
-"""
+"""Console output: progress and tables without a terminal, and error messages in one line."""
 
 import io
 import logging
@@ -21,7 +19,6 @@ from morgs_mi.cli.console import (
     printable,
     progress,
     sentence_of,
-    with_option_names,
 )
 from morgs_mi.cli.streams import rendering
 
@@ -117,12 +114,13 @@ def test_LogHandler__prints_one_line_with_the_level(capsys):
             FileNotFoundError(2, "No such file or directory", "a/b"),
             "a/b: No such file or directory.",
         ),
-        (OSError("write_png(): cannot write a.png: full."), "Cannot write a.png: full."),
+        (OSError("write_png(): cannot write a.png: full."), "cannot write a.png: full."),
         (
             FileExistsError("f(): out is not empty; set `overwrite`."),
-            "out is not empty; set --overwrite.",
+            "out is not empty; set `overwrite`.",
         ),
-        (ValueError("f(): `b` must\nbe 1."), "f(): `b` must be 1."),
+        (ValueError("A.f(): `b` must\nbe 1."), "`b` must be 1."),
+        (ValueError("clip (1): `b` must be 1."), "clip (1): `b` must be 1."),
         (MemoryError(), "Out of memory; process smaller images, or fewer frames or Gaussians."),
         (
             AttributeError("no a."),
@@ -131,22 +129,7 @@ def test_LogHandler__prints_one_line_with_the_level(capsys):
     ],
 )
 def test_sentence_of__has_no_number_and_no_function(error, sentence):
-    assert sentence_of(error, {"overwrite": "--overwrite"}) == sentence
-
-
-@pytest.mark.parametrize(
-    ("sentence", "expected"),
-    [
-        ("f(): `a` must be 1, got 2.", "--a must be 1, got 2."),
-        ("A.f(): `b` must be below `a`.", "`b` must be below --a."),
-        ("clip: `a` must be 1.", "clip: --a must be 1."),
-        ("clip/cam.mp4: use `a=3` or `b`.", "clip/cam.mp4: use --a 3 or `b`."),
-        ("clip/file.json: `a` must be 1.", "clip/file.json: `a` must be 1."),
-        ("f(): `x.a` must be 1.", "--x-a must be 1."),
-    ],
-)
-def test_with_option_names__changes_only_arguments(sentence, expected):
-    assert with_option_names(sentence, {"a": "--a", "x.a": "--x-a"}, "clip") == expected
+    assert sentence_of(error) == sentence
 
 
 def test_progress__ends_a_stage_where_the_next_one_begins(monkeypatch):

@@ -86,7 +86,7 @@ def test_commands__name_the_option_of_cameras_that_are_left_out(name, capture, t
     }[name]
     status, _, error = run(name, *words, "--exclude", "nobody")
     assert status == 1
-    assert "--exclude must name cameras of " in error.splitlines()[-1]
+    assert "`without` must name cameras of " in error.splitlines()[-1]
 
 
 def test_commands__name_no_folder_in_the_help_that_they_have_no_argument_for(capsys):

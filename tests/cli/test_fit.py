@@ -84,14 +84,14 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
+        (["--downscale", "0.5"], ("`downscale` must be at least 1, got 0.5",)),
         (
             ["--hold-out", "3"],
-            ("--hold-out must be an index in 0..2 or one of cam0, cam1, cam2", "got '3'"),
+            ("`test_view` must be an index in 0..2 or one of cam0, cam1, cam2", "got '3'"),
         ),
-        (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
-        (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
-        (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
+        (["--offset", "cam9", "1"], ("`offset` must name cameras of cam0, cam1, cam2, got cam9",)),
+        (["--quality", "nan"], ("`codec.quality` must be a finite number, above 0, got nan",)),
+        (["--flow", "none"], ("`motion.flow_method` must be one of dis,", "got 'none'")),
         (["--flow", "files:nowhere"], ("nowhere",)),
         (
             ["--config", "nowhere.toml"],
@@ -158,7 +158,7 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path, run, monkeypatch):
     clip = colmap(tmp_path / "clip")  # 62x46
     assert_refused(
         run("fit", clip, tmp_path / "out", "--downscale", 1.5),
-        "--downscale must leave images of at least 32 pixels on each side, got 1.5; use at most "
+        "`downscale` must leave images of at least 32 pixels on each side, got 1.5; use at most "
         "1.43.",
     )
     assert (

@@ -29,12 +29,12 @@ def test_main__names_a_missing_capture(tmp_path, run):
     [
         (
             ("synth", "spheres", "OUT", "--width", 3),
-            ("--width must be at least 2 and a multiple of 2, got 3",),
+            ("`width` must be at least 2 and a multiple of 2, got 3",),
         ),
-        (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
+        (("demo", "OUT", "--cameras", 1), ("`cameras` must be at least 2, got 1",)),
     ],
 )
-def test_main__names_options_not_arguments(tmp_path, run, args, parts):
+def test_main__names_arguments_without_functions(tmp_path, run, args, parts):
     out = tmp_path / "out"
     status, _, error = run(*(out if arg == "OUT" else arg for arg in args))
     assert status == 1

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -79,8 +79,6 @@ class Info:
     time: Flag = False
     """Estimate the time offsets of the cameras from what moves in the first frames."""
     reading: GivenReading = field(default_factory=Reading)
-
-    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
         if self.plot is not None:
@@ -166,8 +164,6 @@ class Calibrate:
     """Cameras that are left out, by name."""
     overwrite: Flag = False
     """Replace an earlier model in FOLDER/sparse."""
-
-    arguments: ClassVar[Mapping[str, str]] = {"without": "--exclude"}
 
     def run(self) -> None:
         from morgs_mi.extras.calibration.calibrate import calibrate

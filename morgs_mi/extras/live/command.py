@@ -5,11 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import mitsuba as mi
 import numpy as np
@@ -64,8 +64,6 @@ class Live:
     browser: bool = True
     """Open the viewer in the browser of this machine."""
     settings: Annotated[LiveSettings, arg(name="")] = field(default_factory=LiveSettings)
-
-    arguments: ClassVar[Mapping[str, str]] = {"without": "--exclude", "test_view": "--hold-out"}
 
     def run(self) -> None:
         from morgs_mi.extras.live.fit_live import fit_live

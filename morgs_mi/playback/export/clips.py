@@ -44,17 +44,17 @@ def frame_numbers(stream: FrameSource) -> list[int]:
     return numbers
 
 
-def select_frames(stream: FrameSource, span: str | None) -> list[int]:
-    """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``;
+def select_frames(stream: FrameSource, frames: str | None) -> list[int]:
+    """Return the frames of a stream that `frames` selects: ``12``, ``10:20`` (without 20), ``::5``;
     None selects all.
 
     Raises:
-        ValueError: `span` has another syntax, or selects no frame of the stream.
+        ValueError: `frames` has another syntax, or selects no frame of the stream.
     """
     numbers = frame_numbers(stream)
-    if span is None:
+    if frames is None:
         return numbers
-    parts = span.split(":")
+    parts = frames.split(":")
     defaults = (numbers[0], numbers[-1] + 1, 1)
     try:
         pairs = zip(parts, defaults, strict=len(parts) > len(defaults))
@@ -63,11 +63,11 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
         indices = range(start, stop, step)
     except ValueError:
         indices = range(0)
-    if frames := [number for number in numbers if number in indices]:
-        return frames
+    if selected := [number for number in numbers if number in indices]:
+        return selected
     raise ValueError(
-        "select_frames(): `span` must be like 12, 10:20 or 0:100:5 and select frames of "
-        f"{stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
+        "select_frames(): `frames` must be like 12, 10:20 or 0:100:5 and select frames of "
+        f"{stream.path}, {numbers[0]} to {numbers[-1]}, got {frames!r}."
     )
 
 

@@ -225,8 +225,8 @@ def test_import__reads_what_export_writes(clip, tmp_path, run):
     ("options", "message"),
     [
         ((), "expected FRAMES and OUT, got fewer"),
-        (("OUT", "--fps", 0), "--fps must be a number in [1e-6, 1e6], got 0.0"),
-        (("OUT", "--quality", -1), "--quality must be above 0, got -1"),
+        (("OUT", "--fps", 0), "`fps` must be a number in [1e-6, 1e6], got 0.0"),
+        (("OUT", "--quality", -1), "`quality` must be above 0, got -1"),
     ],
 )
 def test_import__refuses(clip, tmp_path, run, monkeypatch, options, message):

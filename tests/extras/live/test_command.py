@@ -68,8 +68,8 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture, tmp_path, videos, run, mon
 @pytest.mark.parametrize(
     ("args", "part"),
     [
-        ((), "--camera must have a source per camera, got none"),
-        (("--timeout", 1e18), "--timeout must be above 0 and at most 1000000, got 1e+18"),
+        ((), "`camera` must have a source per camera, got none"),
+        (("--timeout", 1e18), "`timeout` must be above 0 and at most 1000000, got 1e+18"),
     ],
 )
 def test_Live__refuses_in_one_sentence(capture, tmp_path, run, args, part):

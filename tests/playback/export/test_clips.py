@@ -191,7 +191,7 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
         (
             ("ply", "--frames", "a:b"),
-            "--frames must be like 12, 10:20 or 0:100:5 and select frames of",
+            "`frames` must be like 12, 10:20 or 0:100:5 and select frames of",
         ),
         (("video", "x.avi"), "x.avi: the output must be FILE.mp4 or FILE.webm, got '.avi'; name "),
         (
