@@ -235,7 +235,7 @@ def named_path(
         means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
         return orbit(cameras, focus(cameras, means), degrees, clip)
     origin = stream_origin(stream)
-    path = load_path(name, moved(cameras, -origin))
+    path = load_path(name, cameras[0])
     return replace(path, keys=moved(path.keys, origin))
 
 

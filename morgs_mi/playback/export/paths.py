@@ -7,12 +7,12 @@ the principal point a cubic spline in pixels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
@@ -175,14 +175,12 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
     return CameraPath(np.concatenate([[0], np.cumsum(steps)]), tuple(keys)).with_duration(seconds)
 
 
-def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
-    """Read a path from a JSON object with `keys` and, common to all of them, `width`, `height`,
-    `fov_x` and `up`.
+def load_path(file: str | Path, first: Camera) -> CameraPath:
+    """Read a path from a JSON object with `keys` and, common to all of them, `width`, `height` and
+    `fov_x`.
 
-    A key has a `time` in seconds and one of `camera` (a name of the rig), `viewmat` (world to
-    camera, OpenCV's axes, 4x4) and `position` with `target`; the last two may have their own
-    `fov_x` (horizontal, degrees) and `up`. The defaults are the size and intrinsics of the rig's
-    first camera and the rig's mean up.
+    A key has a `time` in seconds and a `viewmat` (world to camera, OpenCV's axes, 4x4), and may
+    have its own `fov_x` (horizontal, degrees). The defaults are the size and intrinsics of `first`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -197,38 +195,21 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
             place = f"{file}: key {i}"
             key = {**document, **entry}
             times.append(float(key["time"]))
-            views.append(_key_view(key, cameras))
+            width = int(key.get("width", first.width))
+            height = int(key.get("height", first.height))
+            view = first.resized(width, height)
+            if "fov_x" in key:
+                view = replace(view, K=intrinsics_of_fov(float(key["fov_x"]), width, height))
+            viewmat = rigid("`viewmat`", np.asarray(key["viewmat"], np.float64))
+            views.append(replace(view, viewmat=viewmat))
         place = file
         return CameraPath(np.asarray(times), tuple(views))
     except (KeyError, ValueError, TypeError, OverflowError) as error:
         raise ValueError(
             f"{place}: expected a JSON object with a list `keys` of views, got "
-            f"{shortened(document)} ({type(error).__name__}: {error}); write the views of the "
-            "camera path as `keys`."
+            f"{shortened(document)} ({type(error).__name__}: {error}); write a `time` and a "
+            "`viewmat` for each of the `keys`."
         ) from None
-
-
-def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
-    """Return the view of one key of a JSON path."""
-    first = cameras[0]
-    like = first.resized(int(key.get("width", first.width)), int(key.get("height", first.height)))
-    if "camera" in key:
-        name = key["camera"]
-        by_name = {camera.name: camera for camera in cameras}
-        if name not in by_name:
-            raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {name!r}")
-        return by_name[name].resized(like.width, like.height)
-    if "fov_x" in key:
-        like = replace(like, K=intrinsics_of_fov(float(key["fov_x"]), like.width, like.height))
-    if "viewmat" in key:
-        return replace(like, viewmat=rigid("`viewmat`", np.asarray(key["viewmat"], np.float64)))
-    key = {"up": up_direction(cameras), **key}
-    position, target, up = (
-        np.asarray(key[name], np.float64).reshape(3) for name in ("position", "target", "up")
-    )
-    if not np.cross(target - position, up).any():
-        raise ValueError("the view must not be along `up`")
-    return _look_at(position, target, up, like)
 
 
 def _look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, like: Camera) -> Camera:

@@ -12,6 +12,7 @@ from numpy.testing import assert_array_equal
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light
+from morgs_mi.core.rig import moved
 from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.io.ply import read_ply
 from morgs_mi.playback.export.clips import (
@@ -37,6 +38,15 @@ def run(*args):
     return main([str(arg) for arg in args])
 
 
+def write_path(file, cameras, seconds=1.0, **size):
+    """Write a camera path from one camera to the next, `seconds` for each."""
+    keys = [
+        {"time": seconds * k, "viewmat": np.asarray(camera.viewmat).tolist()}
+        for k, camera in enumerate(cameras)
+    ]
+    file.write_text(json.dumps({"keys": keys, **size}))
+
+
 def test_export_ply__writes_every_frame(stream, tmp_path):
     assert run("export", "ply", tmp_path) == 0
     assert [path.name for path in sorted((tmp_path / "ply").iterdir())] == [
@@ -51,13 +61,11 @@ def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
     metadata = {"origin": [500000.0, 5300000.0, 0]}
     write_stream(tmp_path / "stream.morgs", metadata=metadata)
     stream = StreamReader(tmp_path / "stream.morgs")
-    keys = [{"camera": stream.cameras[0].name}, {"position": [500000, 5300009, 0]}]
-    common = {"target": [500000, 5300000, 0], "up": [0, 0, 1]}
-    keys = [{"time": t, **common, **key} for t, key in enumerate(keys)]
-    (tmp_path / "path.json").write_text(json.dumps({"keys": keys}))
-    first, last = named_path(stream, str(tmp_path / "path.json")).keys
-    assert_close(first.viewmat, stream.cameras[0].viewmat, atol=1e-6)
-    assert_close(last.position, [0, 9, 0], atol=1e-6)
+    far = moved(stream.cameras[:2], -np.array(metadata["origin"]))
+    write_path(tmp_path / "path.json", far)
+    path = named_path(stream, str(tmp_path / "path.json"))
+    for key, camera in zip(path.keys, stream.cameras[:2], strict=True):
+        assert_close(key.viewmat, camera.viewmat, atol=1e-6)
     assert run("export", "ply", tmp_path, "--frames", "0") == 0
     assert "relative to the origin (500000, 5300000, 0)" in capsys.readouterr().out
     write_web_folder(stream, tmp_path / "web")
@@ -68,8 +76,7 @@ def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
 def test_named_path__has_no_image_of_a_camera_behind_its_views(tmp_path, monkeypatch, name):
     """A path in a file may claim any size, to which the image would be enlarged."""
     monkeypatch.chdir(tmp_path)
-    keys = [{"time": time, "camera": "left"} for time in (0, 1)]
-    (tmp_path / "path.json").write_text(json.dumps({"width": 10**9, "height": 9, "keys": keys}))
+    write_path(tmp_path / "path.json", rig()[:1] * 2, width=10**9, height=9)
     cameras = [replace(c, background=np.zeros((c.height, c.width, 3))) for c in rig()]
     write_stream(tmp_path / "stream.morgs", cameras=cameras)
     path = named_path(StreamReader(tmp_path / "stream.morgs"), name)
@@ -132,8 +139,7 @@ def test_export__refuses_a_folder_in_place_of_a_file_before_it_begins(stream, tm
 def test_flight__shows_rendered_images_again_or_back_and_forth(
     stream, tmp_path, seconds, options, shown
 ):
-    keys = [{"time": 0, "camera": "middle"}, {"time": seconds, "camera": "middle"}]
-    (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
+    write_path(tmp_path / "still.json", rig()[1:2] * 2, seconds)
     assert run("export", "video", tmp_path, "--path", tmp_path / "still.json", *options) == 0
     expected = [
         np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream

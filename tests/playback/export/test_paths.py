@@ -15,6 +15,7 @@ from tests.scenes.cameras import circle, look_at_cameras
 from tests.scenes.changing_splats import rig
 
 TARGET = np.array([0, 0, 0.2])
+VIEWMAT = rig()[0].viewmat.tolist()
 
 
 def ring(count):
@@ -78,19 +79,15 @@ def test_focus__is_the_intersection_of_the_axes_or_the_median_of_the_gaussians()
     )
 
 
-def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
-    keys = [
-        {"time": 0, "camera": "right"},
-        {"time": 1, "viewmat": rig()[1].viewmat.tolist()},
-        {"time": 2, "position": [-1, -4, 1], "target": [0, 0, 0.2], "fov_x": 45},
-    ]
-    (tmp_path / "path.json").write_text(
-        json.dumps({"width": 128, "height": 96, "up": [0, 0, 1], "keys": keys})
-    )
-    path = load_path(tmp_path / "path.json", rig())
-    for key, camera in zip(path.keys, rig()[::-1], strict=True):
+def test_load_path__reads_matrices_sizes_and_angles(tmp_path):
+    keys = [{"time": t, "viewmat": camera.viewmat.tolist()} for t, camera in enumerate(rig())]
+    keys[2]["fov_x"] = 60
+    (tmp_path / "path.json").write_text(json.dumps({"width": 128, "height": 96, "keys": keys}))
+    path = load_path(tmp_path / "path.json", rig()[0])
+    for key, camera in zip(path.keys, rig(), strict=True):
         assert_close(key.viewmat, camera.viewmat, atol=1e-12)
-        assert_close(key.K, camera.resized(128, 96).K, atol=1e-9)
+    assert_close(path.keys[1].K, rig()[0].resized(128, 96).K, atol=1e-9)
+    assert path.keys[2].K[0, 0] == pytest.approx(64 / np.tan(np.pi / 6))
 
 
 @pytest.mark.parametrize(
@@ -98,33 +95,29 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
     [
         ("[", "expected JSON, got a broken file"),
         (
-            '{"keys": [{"time": 0, "camera": "left", "width": 1e999}]}',
+            '{"keys": [{"time": 0, "width": 1e999}]}',
             "cannot convert float infinity",
         ),
         (
             '{"cameras": []}',
-            "a list `keys` of views, got {'cameras': []} (KeyError: 'keys'); write the views of",
+            "a list `keys` of views, got {'cameras': []} (KeyError: 'keys'); write a `time` and",
         ),
         (
             '[{"id": 0, "img_name": "a"}]',
             "a list `keys` of views, got [{'id': 0, 'img_name': 'a'}] (TypeError",
         ),
-        ('{"keys": [{"time": 0, "camera": "left"}]}', "at least two key views of one size"),
+        (f'{{"keys": [{{"time": 0, "viewmat": {VIEWMAT}}}]}}', "two key views of one size"),
+        (f'{{"keys": [{{"viewmat": {VIEWMAT}}}]}}', "key 0: expected a JSON object"),
         (
-            '{"keys": [{"time": 0, "camera": "up"}]}',
-            "`camera` must be one of left, middle, right, got 'up'",
-        ),
-        ('{"keys": [{"camera": "left"}]}', "key 0: expected a JSON object"),
-        (
-            '{"keys": [{"time": 0, "position": [0, 0], "target": [0, 0, 1]}]}',
-            "key 0: expected a JSON object",
+            '{"keys": [{"time": 0, "camera": "left"}]}',
+            "(KeyError: 'viewmat'); write a `time` and a `viewmat` for each of the `keys`.",
         ),
         (
             '{"keys": [{"time": 0, "viewmat": [[1, 0], [0, 1]]}]}',
             "`viewmat`: the pose must be a matrix",
         ),
         (
-            '{"keys": [{"time": 1, "camera": "left"}, {"time": 0, "camera": "left"}]}',
+            f'{{"viewmat": {VIEWMAT}, "keys": [{{"time": 1}}, {{"time": 0}}]}}',
             "`times` that increase from 0, got 2 views",
         ),
     ],
@@ -132,7 +125,7 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
 def test_load_path__reports_broken_json(tmp_path, text, message):
     (tmp_path / "path.json").write_text(text)
     with pytest.raises(ValueError, match=r"path\.json: ") as caught:
-        load_path(tmp_path / "path.json", rig())
+        load_path(tmp_path / "path.json", rig()[0])
     assert message in str(caught.value)
 
 
