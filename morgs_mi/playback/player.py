@@ -94,7 +94,7 @@ def has_confidence(stream: FrameSource) -> bool:
         ValueError: the header's metadata or the first packet is broken.
     """
     first_frames = islice(play(stream), 1)
-    return metadata_entry(stream, "config.motion.learn_confidence", True, bool) and any(
+    return metadata_entry(stream, "config.motion.learn_confidence") and any(
         gaussians.logit_confidence is not None for _, gaussians in first_frames
     )
 

@@ -8,10 +8,10 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from reprlib import repr as shortened
-from types import NoneType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.fingerprint import fingerprint
@@ -20,20 +20,29 @@ from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.platform.bounded import JsonObject, read_json
-from morgs_mi.platform.checks import bounded, check_number, numbers, view_index
-from morgs_mi.platform.config import Config, apply_values, types_of
+from morgs_mi.platform.checks import LARGEST, view_index
+from morgs_mi.platform.config import Config, apply_values, check_value, types_of
 from morgs_mi.platform.files import CAPTURE, REPORT, STREAM
 from morgs_mi.playback.default_rig import BOX
 from morgs_mi.render.render_config import RenderConfig
 
-_JSON_TYPES = {
-    dict: "an object",
-    list: "a list",
-    bool: "true or false",
-    int: "an integer",
-    float: "a number",
-    str: "a string",
-    NoneType: "null",
+_Coordinate = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
+_Point = tuple[_Coordinate, _Coordinate, _Coordinate]
+# Entries of the metadata that are read, with dots between the names of nested objects: their types,
+# and the values of missing ones. A stream may come from anybody, and its metadata be any object.
+_SCHEMA: dict[str, tuple[Any, Any]] = {
+    "num_frames": (int, 0),
+    "fingerprint": (str | None, None),  # imported streams have none
+    "origin": (_Point, (0.0, 0.0, 0.0)),
+    BOX: (tuple[_Point, _Point], None),
+    "distortions": (dict[str, tuple[_Coordinate, _Coordinate]], {}),
+    "downscale": (float, 1),
+    "test_view": (tuple[int | str, ...] | int | str | None, "auto"),
+    "reading": (dict, {}),
+    "transfer.display_exposure": (Annotated[float, Ge(-100), Le(100)], 0.0),
+    "config.render": (dict, {}),
+    "config.fit.refine_cameras": (str, "off"),
+    "config.motion.learn_confidence": (bool, True),
 }
 
 
@@ -79,6 +88,39 @@ def _nearest_pixels(count: int, length: int) -> np.ndarray:
     return ((np.arange(count) + 0.5) * length / count).astype(int)
 
 
+def metadata_entry(stream: FrameSource, key: str) -> Any:
+    """Return an entry of a stream's metadata, with tuples for lists.
+
+    Args:
+        stream: the file.
+        key: of the schema.
+
+    Raises:
+        ValueError: it has another type, or lies outside of its range.
+    """
+    kind, value = _SCHEMA[key]
+    entries: Any = stream.metadata
+    *tables, name = key.split(".")
+    for table in tables:
+        entries = entries.get(table, {})
+        check_value(_place(stream), key, entries, dict)
+    if name in entries:
+        value = _tuples(entries[name])
+        check_value(_place(stream), key, value, kind)
+    return value
+
+
+def _tuples(value: Any) -> Any:
+    """Return a JSON value with tuples for lists."""
+    if isinstance(value, dict):
+        return {name: _tuples(item) for name, item in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _place(stream: FrameSource) -> str:
+    return f"{stream.path}: packet 0: metadata"
+
+
 def render_config(stream: FrameSource) -> RenderConfig:
     """Return the renderer settings of the fit.
 
@@ -90,9 +132,9 @@ def render_config(stream: FrameSource) -> RenderConfig:
 
 def _stored_config(stream: FrameSource, key: str, default: Config) -> Config:
     """Return the settings of a header under a key; older streams have some that went."""
-    values = metadata_entry(stream, key, {}, dict)
+    values = metadata_entry(stream, key)
     settings = {name: values[name] for name in types_of(type(default)).keys() & values}
-    return apply_values(default, settings, _place(stream, key))
+    return apply_values(default, settings, f"{_place(stream)}: `{key}`")
 
 
 def stream_exposure(stream: FrameSource) -> float:
@@ -102,10 +144,7 @@ def stream_exposure(stream: FrameSource) -> float:
     Raises:
         ValueError: the header has another value than a number from -100 to 100.
     """
-    key = "transfer.display_exposure"
-    stops = metadata_entry(stream, key, 0.0, int, float)
-    check_number(_place(stream, key), "display_exposure", stops, "[-100, 100]")
-    return float(stops)
+    return float(metadata_entry(stream, "transfer.display_exposure"))
 
 
 def num_frames(stream: FrameSource) -> int:
@@ -115,7 +154,7 @@ def num_frames(stream: FrameSource) -> int:
     Raises:
         ValueError: the header states something else.
     """
-    return metadata_entry(stream, "num_frames", 0, int)
+    return metadata_entry(stream, "num_frames")
 
 
 def stream_origin(stream: FrameSource) -> np.ndarray:
@@ -124,64 +163,18 @@ def stream_origin(stream: FrameSource) -> np.ndarray:
     Raises:
         ValueError: the stream's header states something else.
     """
-    return _header_numbers(stream, "origin", stream.metadata.get("origin", [0.0, 0.0, 0.0]), (3,))
+    return np.array(metadata_entry(stream, "origin"), np.float64)
 
 
-def stream_box(stream: FrameSource) -> np.ndarray:
-    """Return the `scene_box` [2, 3] that the cameras of a stream without a recording see.
-
-    Raises:
-        ValueError: the stream's header states something else, or nothing.
-    """
-    return _header_numbers(stream, BOX, stream.metadata.get(BOX), (2, 3))
-
-
-def _header_numbers(
-    stream: FrameSource, key: str, values: Any, shape: tuple[int, ...]
-) -> np.ndarray:
-    """Return numbers of the header's metadata, float64 of a shape.
+def stream_box(stream: FrameSource) -> np.ndarray | None:
+    """Return the `scene_box` [2, 3] that the cameras of a stream without a recording see; None of
+    a recording.
 
     Raises:
-        ValueError: they are none, or have another shape.
+        ValueError: the stream's header states something else.
     """
-    array = numbers(f"{stream.path}: packet 0", key, values)
-    if array.shape != shape or not bounded(array):
-        raise ValueError(
-            f"{_place(stream, key)} must be numbers of the shape {list(shape)}, got "
-            f"{shortened(values)}; fit the capture again."
-        )
-    return array.astype(np.float64)
-
-
-def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) -> Any:
-    """Return an entry of a stream's metadata, `default` where there is none.
-
-    A stream may come from anybody, and its metadata may be any JSON object.
-
-    Args:
-        stream: the file.
-        key: names of the nested objects and of the entry, with dots between them.
-        default: value of a missing entry.
-        kinds: types that the entry may have.
-
-    Raises:
-        ValueError: it has another type.
-    """
-    value: Any = stream.metadata
-    for name in key.split("."):
-        if isinstance(value, dict) and name not in value:
-            return default
-        value = value[name] if isinstance(value, dict) else None
-    if type(value) in kinds:
-        return value
-    names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
-    raise ValueError(
-        f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again."
-    )
-
-
-def _place(stream: FrameSource, key: str) -> str:
-    return f"{stream.path}: packet 0: `{key}` of the header's metadata"
+    box = metadata_entry(stream, BOX)
+    return None if box is None else np.array(box, np.float64)
 
 
 def open_stream_capture(
@@ -206,10 +199,10 @@ def open_stream_capture(
     """
     path = capture or fitted_capture(stream)
     reading = _stored_config(stream, "reading", ReadConfig())
-    downscale = metadata_entry(stream, "downscale", 1, int, float)
-    test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
-    mark = metadata_entry(stream, "fingerprint", None, str, NoneType)  # imported streams have none
-    refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
+    downscale = metadata_entry(stream, "downscale")
+    test_view = metadata_entry(stream, "test_view")
+    mark = metadata_entry(stream, "fingerprint")
+    refines = metadata_entry(stream, "config.fit.refine_cameras") != "off"
     stop = max(frames, default=0) + 1
     recording = load_capture(
         path, downscale, "auto" if test_view == "auto" else None, stop, reading
@@ -276,10 +269,9 @@ def as_fitted(capture: Capture, stream: FrameSource) -> Capture:
     Raises:
         ValueError: the distortions in the stream's header are no pairs of numbers.
     """
-    distortions = metadata_entry(stream, "distortions", {}, dict)
-    values = [distortions.get(name, (0, 0)) for name in capture.names]
-    terms = _header_numbers(stream, "distortions", values, (len(capture.names), 2))
-    return capture.with_cameras(capture.with_delays(stream.cameras), terms.tolist())
+    distortions = metadata_entry(stream, "distortions")
+    terms = [distortions.get(name, (0.0, 0.0)) for name in capture.names]
+    return capture.with_cameras(capture.with_delays(stream.cameras), terms)
 
 
 def about_lenses(capture: Capture) -> JsonObject:

@@ -75,33 +75,33 @@ def test_render_config__ignores_settings_that_went():
         (
             {"config": {"render": {"alpha_min": "x"}}},
             render_config,
-            r"`config.render` of the header's metadata: `alpha_min` must be .* got 'x'",
+            r"`config.render`: `alpha_min` must be .* got 'x'",
         ),
         (
             {"config": {"motion": 1}},
             has_confidence,
-            r"`config.motion.learn_confidence` of .* must be true or false",
+            r"`config.motion.learn_confidence` must be a table",
         ),
         (
             {"num_frames": "many"},
             num_frames,
-            r"`num_frames` of the header's metadata must be an integer, got 'many'",
+            r"`num_frames` must be a whole number below 2.64, got 'many'",
         ),
         (
             {"test_view": 1.5},
             capture_of,
-            r"`test_view` of .* must be a list or an integer or a string or null, got 1.5",
+            r"`test_view` must be a list or a whole number .* or a string, got 1.5",
         ),
         (
             {"transfer": {"display_exposure": 1e9}},
             stream_exposure,
-            r"`transfer.display_exposure` of the header's metadata",
+            r"`transfer.display_exposure` must be at least -100 and at most 100",
         ),
         ({"origin": [1, 2, 1e13]}, stream_origin, r"`origin` .*must be"),
         (
             {"reading": {"offset": {"cam0": 2}, "trim": 1}},
             capture_of,
-            r"metadata: `trim` must be true or false, got 1",
+            r"`trim` must be true or false, got 1",
         ),
     ],
 )

@@ -210,8 +210,8 @@ def _first_paint(stream: FrameSource, server: str, poster: int | None) -> dict[s
     """
     camera = stream.cameras[0]
     corners = np.array([[0, 0], camera.size])
-    if stream.metadata.get(BOX) is not None:
-        corners, _ = camera.project(box_corners(stream_box(stream)))
+    if (box := stream_box(stream)) is not None:
+        corners, _ = camera.project(box_corners(box))
     x, y = corners.min(axis=0)
     width, height = np.ptp(corners, axis=0)
     image = "data:,"
@@ -283,7 +283,7 @@ def published_bytes(stream: FrameSource, progress: ImageReport | None = None) ->
         # scene.
         scale = np.percentile(speeds, 99, weights=weights, method="inverted_cdf")
     metadata: JsonObject = {
-        "config": {"render": metadata_entry(stream, "config.render", {}, dict)},
+        "config": {"render": metadata_entry(stream, "config.render")},
         "motion_scale": max(_LEAST_SCALE, float(scale)),
         "origin": stream_origin(stream).tolist(),
         DEFAULT_RIG: stream.metadata.get(DEFAULT_RIG) is True,

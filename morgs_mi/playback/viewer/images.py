@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 from threading import Lock
-from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -116,7 +115,7 @@ class RecordedImages:
         """
         if self._folder is not None:
             return self._folder
-        has_mark = metadata_entry(stream, "fingerprint", None, str, NoneType) is not None
+        has_mark = metadata_entry(stream, "fingerprint") is not None
         require(
             has_mark or not self._is_public,
             stream.path,
