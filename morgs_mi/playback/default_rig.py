@@ -23,7 +23,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from reprlib import repr as shortened
 from typing import Literal
 
 import numpy as np
@@ -72,8 +71,6 @@ _MARGIN = 1.05
 _LEAST_EXTENT = 1e-6  # of the distance from the origin
 # Share of the Gaussians, weighted by opacity, that all cameras together see at least.
 _LEAST_SEEN = 0.03
-# Share that each camera sees at least, of the share of the camera that sees most.
-_LEAST_RELATIVE = 0.02
 # Extent of what a camera sees, in widths of its image: below, the scene is a dot.
 _LEAST_EXTENT_SEEN = 0.03
 _LOG = logging.getLogger(__name__)
@@ -89,25 +86,26 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
     Raises:
         ValueError: an entry is broken.
     """
-    for folder in path.resolve().parents[:3]:
-        file = folder / "cameras.json"
-        rows = read_json(file) if file.is_file() else None
-        if not rows or not isinstance(rows, list):
-            continue
-        if not all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows):
-            continue
-        warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
-        cameras = []
-        for i in range(0, len(rows), -(-len(rows) // _MOST_CAMERAS)):
-            row = rows[i]
-            with errors_at(f"{file}: entry {i}: expected a camera, got a broken one"):
-                R, position = (np.asarray(row[key], float) for key in ("rotation", "position"))
-                width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
-                K = intrinsic_matrix(fx, fy, width / 2, height / 2)
-                name = str(row.get("img_name", i))
-                cameras.append(Camera(K, pose_at(R.T, position), round(width), round(height), name))
-        return file, tuple(cameras)
-    return None, ()
+    files = (folder / "cameras.json" for folder in path.resolve().parents[:3])
+    file = next(filter(Path.is_file, files), None)
+    rows = [] if file is None else read_json(file)
+    if file is None or not isinstance(rows, list) or not all(map(_is_camera, rows)):
+        return None, ()
+    warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
+    cameras = []
+    for i in range(0, len(rows), -(-len(rows) // _MOST_CAMERAS) or 1):
+        row = rows[i]
+        with errors_at(f"{file}: entry {i}: expected a camera, got a broken one"):
+            R, position = (np.asarray(row[key], float) for key in ("rotation", "position"))
+            width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
+            K = intrinsic_matrix(fx, fy, width / 2, height / 2)
+            name = str(row.get("img_name", i))
+            cameras.append(Camera(K, pose_at(R.T, position), round(width), round(height), name))
+    return file, tuple(cameras)
+
+
+def _is_camera(row: object) -> bool:
+    return isinstance(row, dict) and row.keys() >= _KEYS
 
 
 def scene_box(frames: Sequence[Gaussians]) -> np.ndarray:
@@ -201,8 +199,6 @@ def thinned(gaussians: Gaussians) -> Gaussians:
 def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tuple[Camera, ...]]:
     """Return the cameras with which a file of Gaussians was trained, and the file that has them.
 
-    Cameras that do not see the Gaussians are left out with a warning.
-
     Args:
         path: the file.
         gaussians: its Gaussians.
@@ -218,33 +214,19 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
         return None, ()
     some = thinned(gaussians)
     cameras = with_near_planes(cameras, some.numpy()["means"])
-    visible = np.stack([_seen(some, camera) for camera in cameras])
+    visible = np.any([_seen(some, camera) for camera in cameras], axis=0)
     opacities = np.asarray(some.opacities, np.float64)
-    weights = opacities / opacities.sum()
-    share = visible.any(axis=0) @ weights
-    if share < _LEAST_SEEN:
-        _LOG.warning(
-            "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to "
-            "be of another scene; the cameras are a ring around the Gaussians instead.",
-            file,
-            100 * share,
-            path.name,
-        )
-        return None, ()
-    shares = visible @ weights
-    good = shares >= _LEAST_RELATIVE * shares.max()
-    if not good.all():
-        names = [camera.name for camera, is_good in zip(cameras, good, strict=True) if not is_good]
-        _LOG.warning(
-            "%s: %d of %d cameras are left out, because they see next to nothing of the Gaussians "
-            "of %s: %s.",
-            file,
-            len(names),
-            len(cameras),
-            path.name,
-            shortened(names),
-        )
-    return file, tuple(cameras[i] for i in np.flatnonzero(good))
+    share = opacities[visible].sum() / opacities.sum()
+    if share >= _LEAST_SEEN:
+        return file, cameras
+    _LOG.warning(
+        "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to be "
+        "of another scene; the cameras are a ring around the Gaussians instead.",
+        file,
+        100 * share,
+        path.name,
+    )
+    return None, ()
 
 
 def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:

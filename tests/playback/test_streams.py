@@ -238,16 +238,6 @@ def test_splat_file__has_a_ring_where_the_cameras_are_of_another_scene(tmp_path,
     assert cv2.imread(str(tmp_path / "a.png")).max() > 0
 
 
-def test_splat_file__leaves_out_single_cameras_of_another_scene(tmp_path, caplog):
-    foreign, *others = ring((300, 0, 0), 2)[:1] + list(rig())
-    stream = open_stream(write_model(tmp_path, [foreign, *others]))
-    assert [camera.name for camera in stream.cameras] == ["left", "middle", "right"]
-    assert (
-        "1 of 4 cameras are left out, because they see next to nothing of the Gaussians"
-        in caplog.text
-    )
-
-
 def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
     path = write_model(tmp_path, rig())
     write_ply(path, splats(1))
