@@ -1,7 +1,7 @@
 """A multi-view recording: pinhole cameras and their synchronised frames.
 
 `layouts/reader_registry.py` finds the reader of a capture folder, `layouts/clips.py` finds
-each camera's clip. An optional ``capture.json`` has settings (see `timeline.read_settings`);
+each camera's clip. An optional ``capture.json`` has settings (see `capture_settings`);
 ``truth/`` may hold ground truth.
 """
 
@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from morgs_mi.capture.capture_settings import read_settings
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.calibration import CalibratedView
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.reader_registry import find_reader
 from morgs_mi.capture.recorded_view import RecordedView
-from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
+from morgs_mi.capture.timeline import ClipTimes, ReadConfig, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.rig import with_near_planes
@@ -30,7 +31,7 @@ from morgs_mi.io.clip_readers import FrameReader, open_clips
 from morgs_mi.io.images import ImageOrError
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.platform.bounded import JsonObject
-from morgs_mi.platform.checks import check_points, composed, few, quantity
+from morgs_mi.platform.checks import check_number, check_points, composed, few, quantity
 from morgs_mi.platform.files import CAPTURE
 
 _LOG = logging.getLogger(__name__)
@@ -364,10 +365,10 @@ def load_capture(
     layout = find_reader(path)
     every = layout.read(path).centred(path)
     calibration = every.without(path, reading.without)
-    readers = open_clips(calibration.clips, reading.gaps, settings.get("white"))
+    readers = open_clips(calibration.clips, reading.gaps, settings.white)
     calibrated = _at_clip_sizes(path, calibration.views, readers)
-    common = timeline(path, readers, reading, max_frames, settings.get("fps"))
-    readouts = _readouts(path / CAPTURE, settings.get("readout", 0.0), every.names)
+    common = timeline(path, readers, reading, max_frames, settings.fps)
+    readouts = _readouts(path / CAPTURE, settings.readout, every.names)
     _check_downscale(downscale, calibrated)
     views = []
     for calibrated_view in calibrated:
@@ -396,10 +397,12 @@ def load_capture(
         origin=calibration.origin,
     )
     capture = capture.with_cameras(with_near_planes(capture.cameras, capture.points, reading.near))
-    capture = capture.holding_out(held_out_by(path, test_view, settings, every, calibration))
+    capture = capture.holding_out(
+        held_out_by(path, test_view, settings.test_view, every, calibration)
+    )
     if not any(reader.has_light for reader in readers.values()):
         return capture
-    stops = settings.get("display_exposure")
+    stops = settings.display_exposure
     if stops is None:
         stops = display_stops(next(capture.partial_frames(0, 1)).images)
     return replace(capture, display_exposure=stops)
@@ -412,10 +415,9 @@ def _check_arguments(path: Path, downscale: float, max_frames: int | None) -> No
             f"{path}: expected a capture folder, found {kind}; name one that has a video, or a "
             "folder of images, for each camera."
         )
-    if not downscale >= 1:
-        raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
-    if max_frames is not None and max_frames < 1:
-        raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
+    check_number("load_capture()", "downscale", downscale, "[1, inf)")
+    if max_frames is not None:
+        check_number("load_capture()", "max_frames", max_frames, "[1, inf)")
 
 
 def _at_clip_sizes(
@@ -454,11 +456,13 @@ def _at_clip_sizes(
     return recorded
 
 
-def _readouts(file: Path, setting: Any, names: Sequence[str]) -> dict[str, float]:
+def _readouts(
+    file: Path, setting: float | dict[str, float], names: Sequence[str]
+) -> dict[str, float]:
     """Return the readouts of cameras by their names, in frames of the clips; `setting` is a number
     for all of them, or an object with some.
     """
-    readouts: JsonObject = setting if isinstance(setting, dict) else dict.fromkeys(names, setting)
+    readouts = setting if isinstance(setting, dict) else dict.fromkeys(names, setting)
     check_names(file, "readout", readouts, names)
     return {composed(name): readout for name, readout in readouts.items()}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.platform.checks import view_index
@@ -19,7 +18,7 @@ _MANY = 6
 def held_out_by(
     path: Path,
     requested: TestViews,
-    settings: dict[str, Any],
+    setting: TestViews,
     every: Calibration,
     subset: Calibration,
 ) -> tuple[int, ...]:
@@ -27,9 +26,9 @@ def held_out_by(
 
     Args:
         path: the capture folder.
-        requested: as for `load_capture`; "auto": by the settings, by the layout, or by the number
-            of cameras.
-        settings: content of the capture's `capture.json`, whose indices count all cameras.
+        requested: as for `load_capture`; "auto": by the setting.
+        setting: of the capture, whose indices count all cameras; "auto": by the layout, or by the
+            number of cameras.
         every: all cameras.
         subset: the cameras that are not left out.
 
@@ -38,12 +37,11 @@ def held_out_by(
     """
     if requested != "auto":
         return held_out_views(path, requested, subset.names)
+    if setting is None:
+        return ()
     names = every.held_out or ()
-    if "test_view" in settings:
-        views = _indices(path / CAPTURE, settings["test_view"], every.names)
-        if not views:
-            return ()
-        names = [every.names[view] for view in views]
+    if setting != "auto":
+        names = [every.names[view] for view in _indices(path / CAPTURE, setting, every.names)]
     names = [name for name in names if name in subset.names]
     if not names and every.held_out != () and len(subset.names) >= _MANY:
         return (0,)

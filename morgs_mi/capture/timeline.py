@@ -1,4 +1,4 @@
-"""Alignment of a capture's clips in time, and the settings that control how they are read.
+"""Alignment of a capture's clips in time.
 
 A timestamp t = 0, 1, ... is a frame of the recording. It is shown by frame k of a clip if
 
@@ -20,24 +20,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import lcm
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.io.clip_readers import FrameReader
-from morgs_mi.platform.bounded import read_json, warn_unread
-from morgs_mi.platform.checks import check_number, composed, few
+from morgs_mi.platform.checks import composed, few
 from morgs_mi.platform.config import config_class
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
-_INTERVALS = {
-    "fps": "[1e-6, 1e6]",
-    "display_exposure": "[-100, 100]",
-    "white": "[1, 65535]",
-}
-_SETTINGS = {*_INTERVALS, "test_view", "readout"}
 # Distance in frames up to which a frame shows a timestamp.
 _NEAR = 0.5
 
@@ -389,30 +381,3 @@ def _num_frames(path: Path, clocks: _Clocks, max_frames: int | None, gaps: bool)
             "clips with --offset, or leave cameras out with --exclude."
         )
     return min(lengths)
-
-
-def read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings in a capture's `capture.json`, or {} without such a file.
-
-    They are ``fps``, ``test_view`` and ``readout``, the frames from the exposure of an image's
-    first row to the exposure of its last row: a number for all cameras, or an object with the
-    numbers that are not 0, by the cameras' names; ``display_exposure`` in stops, see `Capture`; and
-    ``white``, its value in images of 16 bits.
-
-    Raises:
-        ValueError: the file is not a JSON object, or a setting is not valid.
-    """
-    if not path.exists():
-        return {}
-    settings = read_json(path)
-    if not isinstance(settings, dict):
-        raise ValueError(f"{path}: expected a JSON object, got another value; correct it.")
-    if "scene" not in settings:  # a synthetic capture describes itself
-        warn_unread(path, settings.keys() - _SETTINGS)
-    for name, interval in _INTERVALS.items():
-        if (value := settings.get(name)) is not None:
-            check_number(path, name, value, interval)
-    readout = settings.get("readout", 0.0)
-    for value in readout.values() if isinstance(readout, dict) else [readout]:
-        check_number(path, "readout", value, "[-1, 1]")
-    return settings

@@ -150,8 +150,8 @@ def square(camera):
             '{"test_view": "cam07"}',
             r"`test_view` must be an index in 0..\d or one of .*, got .cam07",
         ),
-        ('{"test_view": 1.5}', "`test_view` must be an index .*, got 1.5"),
-        ('{"readout": {"cam01": 2}}', r"`readout` must be a number in \[-1, 1\], got 2"),
+        ('{"test_view": 1.5}', "`test_view` must be a list or a whole number .*, got 1.5"),
+        ('{"readout": {"cam01": 2}}', "`readout` must be .* each value at least -1 and at most 1"),
         (
             '{"readout": {"cam07": 0.4}}',
             "`readout` must name cameras of cam01, cam02, .*got cam07",
@@ -172,8 +172,8 @@ def test_load_capture__refuses_broken_settings(tmp_path, settings, message):
             {"downscale": 2},
             r"`downscale` must leave images of at least 32 pixels .*, got 2; use at most 1.43",
         ),
-        ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
-        ({"max_frames": 0}, "`max_frames` must be at least 1, got 0"),
+        ({"downscale": float("nan")}, r"`downscale` must be a number in \[1, inf\), got nan"),
+        ({"max_frames": 0}, r"`max_frames` must be a number in \[1, inf\), got 0"),
         (
             {"reading": ReadConfig(without=("cam02", "cam09"))},
             "`without` must name cameras of cam01, cam02, got cam09.",
@@ -280,6 +280,6 @@ def test_load_capture__describes_the_folders_that_photos_lack(tmp_path):
     cv2.imwrite(str(tmp_path / "IMG_1.png"), frames(0)[0])
     with pytest.raises(
         FileNotFoundError,
-        match=r"run `morgs-mi calibrate`.* Photos count .*\(1\); .* one folder per camera: c",
+        match=r"run `morgs-mi calibrate` on the folder, which has .* photos of 1 camera",
     ):
         load_capture(tmp_path)

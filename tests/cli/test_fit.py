@@ -84,7 +84,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        (["--downscale", "0.5"], ("`downscale` must be at least 1, got 0.5",)),
+        (["--downscale", "0.5"], ("`downscale` must be a number in [1, inf), got 0.5",)),
         (
             ["--hold-out", "3"],
             ("`test_view` must be an index in 0..2 or one of cam0, cam1, cam2", "got '3'"),

@@ -6,15 +6,13 @@ A module of this folder exposes its `READER`. Extras enter theirs; a script appe
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 
 from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
 from morgs_mi.capture.layouts.calibration import Reader, required_clips
-from morgs_mi.capture.layouts.clips import EXAMPLE
-from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.checks import quantity
 from morgs_mi.platform.extras import extra, places
-from morgs_mi.platform.files import CAPTURE, STREAM
+from morgs_mi.platform.files import STREAM
 
 READERS: list[Reader] = [
     colmap.READER,
@@ -35,23 +33,14 @@ def find_reader(path: Path) -> Reader:
     if reader := next((reader for reader in READERS if reader.find(path)), None):
         return reader
     if (path / STREAM).is_file():
-        description = None
-        with suppress(OSError, ValueError):
-            description = read_json(path / CAPTURE)
-        capture = description.get("capture") if isinstance(description, dict) else None
-        is_named = isinstance(capture, str)
-        advice = f", and `morgs-mi info {capture}` describes its capture" if is_named else ""
         raise FileNotFoundError(
             f"{path}: expected a capture, found a fit; `morgs-mi eval {path}` scores it, "
-            f"`morgs-mi view {path}` shows it{advice}."
+            f"`morgs-mi view {path}` shows it."
         )
     clips = required_clips(path)  # without clips the path itself is likely wrong
-    static = all(isinstance(clip, tuple) for clip in clips.values())
-    recording = (
-        f" Photos count as cameras with one frame each ({len(clips)}); a recording has {EXAMPLE}"
-    )
     *files, last = [file for reader in READERS for file in reader.files]
     raise FileNotFoundError(
         f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run "
-        f"`morgs-mi calibrate` on the folder.{recording if static else ''}"
+        "`morgs-mi calibrate` on the folder, which has the clips or photos of "
+        f"{quantity(len(clips), 'camera')}."
     )

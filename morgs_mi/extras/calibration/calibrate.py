@@ -25,6 +25,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge, Lt
 
+from morgs_mi.capture.capture_settings import read_settings
 from morgs_mi.capture.layouts.clips import (
     EXAMPLE,
     clips_by_camera,
@@ -33,7 +34,7 @@ from morgs_mi.capture.layouts.clips import (
     photos,
 )
 from morgs_mi.capture.masks import opaque_pixels
-from morgs_mi.capture.timeline import nearest_frames, read_settings
+from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.types import Arrays
@@ -313,7 +314,7 @@ def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tupl
             f"{path}: expected the clips of at least two cameras, found "
             f"{', '.join(names) or 'none'}; check the path, or make {EXAMPLE}"
         )
-    white = read_settings(path / CAPTURE).get("white")
+    white = read_settings(path / CAPTURE).white
     readers = open_clips({name: clips[name] for name in names}, white=white)
     # The last timestamp of each clip, in frames of a constant rate.
     last_frames = {

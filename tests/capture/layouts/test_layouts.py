@@ -174,20 +174,12 @@ def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
 
 def test_load_capture__names_what_reads_a_fit(tmp_path):
     (tmp_path / "stream.morgs").touch()
-    start = f"{tmp_path}: expected a capture, found a fit; `morgs-mi eval {tmp_path}` scores it, "
-    for content, rest in (
-        (
-            '{"capture": "clips/walk"}',
-            "shows it, and `morgs-mi info clips/walk` describes its capture.",
-        ),
-        ("{}", f"`morgs-mi view {tmp_path}` shows it."),
-        ('{"capture": 3}', "shows it."),
-    ):
-        (tmp_path / "capture.json").write_text(content)
-        with pytest.raises(FileNotFoundError) as error:
-            load_capture(tmp_path)
-        assert str(error.value).startswith(start)
-        assert str(error.value).endswith(rest)
+    with pytest.raises(FileNotFoundError) as error:
+        load_capture(tmp_path)
+    assert str(error.value) == (
+        f"{tmp_path}: expected a capture, found a fit; `morgs-mi eval {tmp_path}` scores it, "
+        f"`morgs-mi view {tmp_path}` shows it."
+    )
     with pytest.raises(
         FileNotFoundError, match=r"stream\.morgs: expected a capture folder, found a file"
     ):
