@@ -151,10 +151,11 @@ class CameraFeed:
             # The first images have to be complete, and so have the last ones. Otherwise a camera
             # that runs is waited for, unless it is late or was missing before.
             is_awaited = after is None or not is_running or not (late or camera.reason)
-            is_recent = bool(new[name]) and newest - new[name][-1].time <= _MAX_SKEW
-            if is_recent or (is_awaited and name in had_image):
+            if new[name] and newest - new[name][-1].time <= _MAX_SKEW:
                 groups[name] = new[name]
-        if not groups or not all(groups.values()):
+            elif is_awaited and name in had_image:
+                return None
+        if not groups:
             return None
         time_of_slowest = min(shots[-1].time for shots in groups.values())
         chosen = {
@@ -162,9 +163,6 @@ class CameraFeed:
             for name, shots in groups.items()
         }
         times = [shot.time for shot in chosen.values()]
-        skew = max(times) - min(times)
-        if skew > _MAX_SKEW:
-            return None
         skipped = min(shot.number - numbers[name] - 1 for name, shot in chosen.items())
         return FrameSet(
             {name: shot.image for name, shot in chosen.items()},
@@ -173,7 +171,7 @@ class CameraFeed:
                 for name, camera in self._cameras.items()
             },
             max(times),
-            skew,
+            max(times) - min(times),
             0 if after is None else skipped,
         )
 
