@@ -17,7 +17,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.splats import read_splats, suffix_of
-from morgs_mi.platform.checks import errors_at, quantity, require
+from morgs_mi.platform.checks import errors_at, few, quantity, require
 from morgs_mi.platform.files import PROVISIONAL, STREAM
 from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, default_rig, scene_box, trained_cameras
 from morgs_mi.playback.export.web import stream_html
@@ -85,27 +85,27 @@ class SplatFile(FrameSource):
 
 
 def stream_path(out: str | Path) -> Path:
-    """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, or
-    with one fit in it, of its ``stream.morgs``.
+    """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, of its
+    ``stream.morgs``.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: there is a file of another format, or a folder with files of Gaussians instead.
+        ValueError: there is a file of another format, or a folder with fits or files of Gaussians.
     """
     path = Path(out)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; check the path.")
     if path.is_dir() and not (path / STREAM).exists():
-        fits = [path / file.name for file in listed(path) if (file / STREAM).is_file()]
-        if path / "stream" in fits or len(fits) == 1:  # the demo has two fits
-            return stream_path(path / "stream" if path / "stream" in fits else fits[0])
         if (path / "meta.json").is_file():
             refuse_foreign(path / "meta.json")
-        if frames := [file.name for file in listed(path) if suffix_of(file)]:
-            raise ValueError(
-                f"{path}: got a folder with {quantity(len(frames), 'file')} of Gaussians, not a "
-                f"stream; name one, such as {path / frames[0]}, or run `morgs-mi import`."
-            )
+        inner = [file for file in listed(path) if suffix_of(file) or (file / STREAM).is_file()]
+        require(
+            not inner,
+            path,
+            "expected a stream",
+            f"a folder with {few([file.name for file in inner], 3)}",
+            "name one of them, or make a stream of files of Gaussians by `morgs-mi import`",
+        )
     remedy = f"if {path} is a capture, fit it first: morgs-mi fit {path} OUT"
     path = path / STREAM if path.is_dir() else path
     existing_file(path, "a stream", remedy)

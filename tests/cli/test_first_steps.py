@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -19,16 +18,13 @@ from tests.cli.commands import assert_refused
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
 
 
-def test_stream_path__finds_the_fit_in_a_folder(tmp_path):
+def test_stream_path__finds_the_stream_in_the_folder_of_a_fit(tmp_path):
     for name in ("stream", "stream_plain"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "stream.morgs").write_bytes(MAGIC)
-    assert stream_path(tmp_path).parent == tmp_path / "stream"
-    (tmp_path / "stream").rename(tmp_path / "other")
-    with pytest.raises(FileNotFoundError, match="expected a stream, found none"):
-        stream_path(tmp_path)  # either may be meant
-    (tmp_path / "other/stream.morgs").unlink()
-    assert stream_path(tmp_path).parent == tmp_path / "stream_plain"
+    assert stream_path(tmp_path / "stream") == tmp_path / "stream/stream.morgs"
+    with pytest.raises(ValueError, match="got a folder with stream, stream_plain; name one of"):
+        stream_path(tmp_path)
     with pytest.raises(FileNotFoundError, match="typo: no such file or folder; check the path"):
         stream_path(tmp_path / "typo")
 
@@ -117,7 +113,11 @@ def test_info__describes_a_file_of_gaussians(tmp_path, capsys):
     assert error == ""
 
 
-def test_info__finds_the_fit_in_a_folder(fitted_clip, tmp_path, capsys):
-    shutil.copytree(fitted_clip, tmp_path / "demo" / "stream")
-    assert main(["info", str(tmp_path / "demo")]) == 0
-    assert "stream.morgs: " in capsys.readouterr().out
+@pytest.mark.parametrize("inner", ["stream/stream.morgs", "0000.ply"])
+def test_stream_path__names_what_a_folder_has_in_place_of_a_stream(tmp_path, run, inner):
+    file = tmp_path / "demo" / inner
+    file.parent.mkdir(parents=True)
+    file.touch()
+    name = inner.partition("/")[0]
+    for command in ("view", "render"):
+        assert_refused(run(command, tmp_path / "demo"), f"got a folder with {name}; name one of")

@@ -94,4 +94,4 @@ class Demo:
             f"{self.out / 'contact_sheet.png'}"
         )
         print_result(f"All results: {self.out / 'report.json'}")
-        print_next("view", self.out)
+        print_next("view", self.out / "stream")
