@@ -19,21 +19,19 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.core.types import Arrays
-from morgs_mi.platform.checks import few
+from morgs_mi.platform.checks import few, require
 
 _log = logging.getLogger(__name__)
 
-
-# Timestamps and durations; all of a file's Gaussians may be of one timestamp.
+# Properties of a time, a change over time, a fourth axis and the second quaternion of a rotation in
+# four dimensions, which differ among the Gaussians of several timestamps.
 _TIME = re.compile(
     r"t|time|times|timestamp|instant|frame|frame_?(id|index|idx|number)|t_\w+|time_\w+|mu_?t"
     r"|cov_t.*|scale_?t\w*|sigma_?t|trbf_\w+|duration|life(time|span)"
     r"|(start|end|birth|death)_?(time|frame)"
+    r"|(motion|omega|velocity|vel|speed|flow|deform\w*|v|acc\w*)_?(\d+|[xyz])"
+    r"|scale_3|rot_[4-7]|rot_[lr]_\d"
 )
-# Changes over time; they may be 0 everywhere.
-_MOTION = re.compile(r"(motion|omega|velocity|vel|speed|flow|deform\w*|v|acc\w*)_?(\d+|[xyz])")
-# A fourth axis, and the second quaternion of a rotation in four dimensions.
-_FOURTH = re.compile(r"scale_3|rot_[4-7]|rot_[lr]_\d")
 _ANCHOR = re.compile(r"f_offset_\d+|f_anchor_feat_\d+")
 _READ = re.compile(r"[xyz]|f_dc_[0-2]|f_rest_\d+|opacity|scale_[0-2]|rot_[0-3]|filter_3D")
 _HARMLESS = re.compile(
@@ -41,23 +39,23 @@ _HARMLESS = re.compile(
     r"|\w*_?id|index|segment\w*|cluster\w*|class\w*|instance\w*|semantic\w*|object\w*|category"
     r"|selected|state|error|uncertainty|confidence"
 )
-# Kinds that are not read: what was expected and found, and the remedy.
-_REFUSED = {
-    "timestamps": (
-        "the Gaussians of one timestamp, got several timestamps, as of Spacetime Gaussians or 4D "
-        "Gaussian Splatting",
+# Kinds that are not read: properties that vary in them, what was expected, what it is, and the
+# remedy.
+_REFUSED = (
+    (
+        _TIME,
+        "expected the Gaussians of one timestamp",
+        "several timestamps, as of Spacetime Gaussians or 4D Gaussian Splatting",
         "export a .ply of each timestamp with the program that trained them, which `morgs-mi "
         "import` turns into a stream",
     ),
-    "anchors": (
-        "Gaussians, got anchors of Scaffold-GS, of which a network makes the Gaussians of a view",
+    (
+        _ANCHOR,
+        "expected Gaussians",
+        "anchors of Scaffold-GS, of which a network makes the Gaussians of a view",
         "export Gaussians with the program that trained them",
     ),
-    "integers": (
-        "Gaussians with floats, got integers, which stand for entries of a codebook",
-        "export the Gaussians uncompressed",
-    ),
-}
+)
 _GAUSSIAN = {"f_dc_0", "opacity", "scale_0", "rot_0"}
 # Folders and what their files have that is not read: a sequence has a file for every frame.
 _named: set[tuple[Path, str]] = set()
@@ -75,18 +73,17 @@ def as_3dgs(path: str | Path, vertices: Arrays) -> Arrays:
     """
     if vertices.keys().isdisjoint(_GAUSSIAN):
         return vertices
-    # Not all Gaussians of several timestamps in one file are ever in one image.
-    times = [n for n, v in vertices.items() if _TIME.fullmatch(n) and (v != v[:1]).any()]
-    motions = [n for n, v in vertices.items() if _MOTION.fullmatch(n) and (v != 0).any()]
-    evidence = {
-        "timestamps": [*times, *motions, *filter(_FOURTH.fullmatch, vertices)],
-        "anchors": [*filter(_ANCHOR.fullmatch, vertices)],
-        "integers": [n for n, v in vertices.items() if _READ.fullmatch(n) and v.dtype.kind != "f"],
-    }
-    for kind, names in evidence.items():
-        if names:
-            expected, remedy = _REFUSED[kind]
-            raise ValueError(f"{path}: expected {expected} ({few(sorted(names))}); {remedy}.")
+    for pattern, expected, kind, remedy in _REFUSED:
+        names = [n for n, v in vertices.items() if pattern.fullmatch(n) and (v != v[:1]).any()]
+        require(not names, path, expected, f"{kind} ({few(sorted(names))})", remedy)
+    integers = [n for n, v in vertices.items() if _READ.fullmatch(n) and v.dtype.kind != "f"]
+    require(
+        not integers,
+        path,
+        "expected Gaussians with floats",
+        f"integers, which stand for entries of a codebook ({few(integers)})",
+        "export the Gaussians uncompressed",
+    )
     unread = [name for name in vertices if not (_READ.fullmatch(name) or _HARMLESS.fullmatch(name))]
     folder = Path(path).parent
     names = few(sorted([*unread, *[network.name for network in folder.glob("deformation*.pth")]]))
