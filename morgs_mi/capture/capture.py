@@ -233,14 +233,9 @@ class Capture:
             distortions: per camera the radial terms k1, k2 of the distortion left in the images,
                 which is removed as well; empty: none.
         """
-        pairs = zip(self.views, cameras, strict=True)
-        if np.any(distortions):
-            terms = [(float(k1), float(k2)) for k1, k2 in distortions]
-            changes = zip(pairs, terms, strict=True)
-            views = Views(view.refined(camera, term) for (view, camera), term in changes)
-        else:
-            views = Views(replace(view, camera=camera) for view, camera in pairs)
-        return replace(self, views=views)
+        terms = distortions or np.zeros((len(cameras), 2)).tolist()
+        changes = zip(self.views, cameras, terms, strict=True)
+        return replace(self, views=Views(view.refined(c, *term) for view, c, term in changes))
 
     def holding_out(self, views: TestViews) -> Capture:
         """Return the capture with other held-out cameras, by indices or names; None for none.

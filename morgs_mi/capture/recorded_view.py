@@ -80,12 +80,16 @@ class RecordedView(View):
         """Return the view without downscaling."""
         return self.with_camera(self.camera.resized(*self.recorded_size))
 
-    def refined(self, camera: Camera, distortion: tuple[float, float]) -> RecordedView:
-        """Return the view with a refined camera, and images without a distortion left in them."""
+    def refined(self, camera: Camera, k1: float, k2: float) -> RecordedView:
+        """Return the view with a refined camera, and images without the radial terms of the
+        distortion left in them.
+        """
+        if not (k1 or k2):
+            return replace(self, camera=camera)
         recorded = self.camera.resized(*self.recorded_size)
-        refined = camera.resized(*self.recorded_size), Lens("RADIAL", distortion)
+        refined = camera.resized(*self.recorded_size), Lens("RADIAL", (k1, k2))
         maps = undistortion(recorded, self.lens, refined)
-        return replace(self, undistortion=maps, distortion=distortion).with_camera(camera)
+        return replace(self, undistortion=maps, distortion=(k1, k2)).with_camera(camera)
 
     def images(
         self, start: int = 0, stop: int | None = None

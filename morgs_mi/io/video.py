@@ -308,13 +308,9 @@ def _length(
     """Return the time from the first frame to the end that a file states, s; 0 without one."""
     if stream.duration:
         return float(stream.duration * (stream.time_base or 0))
-    end = 0.0
-    if text := stream.metadata.get("DURATION"):  # Matroska: hours:minutes:seconds
-        with suppress(ValueError):
-            end = float(np.dot([3600, 60, 1], [float(part) for part in text.split(":")]))
-    elif container.duration and len(container.streams) == 1:  # otherwise of the sound
-        end = container.duration / 1e6
-    return end - (first.time or 0) if np.isfinite(end) else 0
+    if container.duration and len(container.streams) == 1:  # otherwise of the sound
+        return container.duration / 1e6 - (first.time or 0)
+    return 0.0
 
 
 def _tracks(container: av.container.InputContainer) -> list[av.VideoStream]:

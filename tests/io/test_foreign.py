@@ -28,7 +28,7 @@ def test_refuse_foreign__names_the_remedy_at_every_door(tmp_path, name):
 def test_open_stream__names_what_to_do_with_a_folder_of_gaussians(tmp_path):
     (tmp_path / "1.ply").touch()
     with pytest.raises(
-        ValueError, match=r"got a folder with 1 file of Gaussians.*1\.ply, or run .*import"
+        ValueError, match=r"got a folder with 1\.ply; name one of them, or .*import"
     ):
         open_stream(tmp_path)
     (tmp_path / "meta.json").write_text("{}")
