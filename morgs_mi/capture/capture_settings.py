@@ -28,7 +28,7 @@ class CaptureSettings:
     """
     display_exposure: Annotated[float, Ge(-100), Le(100)] | None = None
     """Stops by which a display brightens EXR files; None: by the first frame."""
-    white: Annotated[float, Ge(1), Le(65535)] | None = None
+    white: Annotated[int, Ge(1), Le(65535)] | None = None
     """Value of white in images of 16 bits; None: the largest."""
 
 

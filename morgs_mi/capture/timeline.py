@@ -16,9 +16,9 @@ frames (see `interpolation`).
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import lcm
 from pathlib import Path
 
 import numpy as np
@@ -167,8 +167,10 @@ def timeline(
         np.array_equal(clip.frame_indices, np.arange(len(timestamps))) for clip in clips.values()
     )
     for name, clip in clips.items():
-        if clocks[name].reader.positions is not None:
-            notes.append(_note_of_variable_rate(clocks[name], clip.frame_indices))
+        reader = readers[name]
+        if reader.positions is not None:
+            text = _variable_rate(reader.positions, exact[name].rate * fps, clip.frame_indices)
+            notes.append(f"{reader.path.name}: variable frame rate, {text}")
     return Timeline(clips, fps, unchanged, tuple(notes))
 
 
@@ -236,10 +238,10 @@ def _by_numbers(
     for name, clock in clocks.items():
         clip = numbers.get(name, range(first, first + 1, min(steps)))
         offset = clock.offset + (common[0] - clip[0]) / clip.step * clock.rate
-        rate = clock.rate * lcm(*steps) / clip.step
+        rate = clock.rate * math.lcm(*steps) / clip.step
         aligned[name] = replace(clock, offset=offset, rate=rate)
     # The time between two timestamps, in frames of the clip with the most frames per time.
-    return aligned, fps / (lcm(*steps) / min(steps)), [note]
+    return aligned, fps / (math.lcm(*steps) / min(steps)), [note]
 
 
 def _notes_of_clips(readers: Mapping[str, FrameReader]) -> list[str]:
@@ -268,17 +270,16 @@ def _time_codes(readers: Mapping[str, FrameReader]) -> list[str]:
     ]
 
 
-def _note_of_variable_rate(clock: _Clock, frame_indices: np.ndarray) -> str:
-    """Return a sentence on a clip of variable frame rate, and on its frames that are shown [T]."""
-    positions = clock.reader.positions
-    period = 1e3 / clock.reader.fps
+def _variable_rate(positions: np.ndarray, fps: float, frame_indices: np.ndarray) -> str:
+    """Return how irregular the frames of a clip at some positions are, and which are shown [T]."""
+    period = 1e3 / fps
     late = np.abs(positions - np.rint(positions)).max() * period
     frames = frame_indices[frame_indices >= 0]
     return (
-        f"{clock.reader.path.name}: variable frame rate, {len(positions)} frames in {clock.length} "
-        f"periods of {period:.1f} ms, up to {late:.1f} ms off; each timestamp has the frame "
-        f"nearest in time: {len(frames) - len(np.unique(frames))} repeat one, "
-        f"{len(frame_indices) - len(frames)} have none."
+        f"{len(positions)} frames in {round(positions[-1]) + 1} periods of {period:.1f} ms, up to "
+        f"{late:.1f} ms off; each timestamp has the frame nearest in time: "
+        f"{len(frames) - len(np.unique(frames))} repeat one, {len(frame_indices) - len(frames)} "
+        "have none."
     )
 
 
@@ -322,15 +323,15 @@ def _common_timestamps(path: Path, clocks: _Clocks, config: ReadConfig, fps: flo
     if not (config.gaps or config.trim):
         for clock in clocks.values():
             _check_complete(clock.reader, clock.reader.num_frames)
-    first = np.ceil(max(clock.timestamp(0) for clock in clocks.values()))
-    last = np.floor(min(clock.timestamp(clock.length - 1) for clock in clocks.values()))
+    first = math.ceil(max(clock.timestamp(0) for clock in clocks.values()))
+    last = math.floor(min(clock.timestamp(clock.length - 1) for clock in clocks.values()))
     if last < first:
         table = ", ".join(
             f"{name} {clock.timestamp(0) / fps:.2f} to {clock.timestamp(clock.length) / fps:.2f} s"
             for name, clock in clocks.items()
         )
         raise ValueError(f"{path}: the clips have no timestamp in common, {table}; check `offset`.")
-    return np.arange(first, last + 1)
+    return np.arange(first, last + 1, dtype=float)
 
 
 def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:

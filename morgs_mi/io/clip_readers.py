@@ -37,10 +37,9 @@ def open_clips(
         FileNotFoundError: a clip is missing, or one of its images.
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
-    folders = aligned_folders(
-        [clip for clip in clips.values() if gaps and isinstance(clip, Path) and clip.is_dir()]
-    )
-    readers = {name: folders.get(clip) or open_frames(clip, gaps) for name, clip in clips.items()}
+    folders = {n: clip for n, clip in clips.items() if isinstance(clip, Path) and clip.is_dir()}
+    aligned = aligned_folders(folders) if gaps else {}
+    readers = {name: aligned.get(name) or open_frames(clip, gaps) for name, clip in clips.items()}
     largest = max(
         (reader.most for reader in readers.values() if reader.most is not None), default=WHITE
     )

@@ -7,7 +7,7 @@ A frame is an RGB array [H, W, 3]: uint8 in sRGB, or of an EXR file float32 in l
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -152,8 +152,8 @@ class FolderReader(Frames):
                     yield ValueError(f"{file}: {error}.")
 
 
-def aligned_folders(folders: Sequence[Path]) -> dict[Path, FolderReader]:
-    """Return the readers of folders of images, aligned by the numbers of their images.
+def aligned_folders(folders: Mapping[str, Path]) -> dict[str, FolderReader]:
+    """Return the readers of cameras' folders of images, aligned by the numbers of their images.
 
     Raises:
         ValueError: the numbers of a folder do not count, those of two do not overlap, or there are
@@ -161,34 +161,33 @@ def aligned_folders(folders: Sequence[Path]) -> dict[Path, FolderReader]:
     """
     if not folders:
         return {}
-    files_by_number = {folder: _images(folder) for folder in folders}
-    for folder, files in files_by_number.items():
-        check_counting(folder, [*files], [file.name for file in files.values()])
-    first = max(map(min, files_by_number.values()))
-    last = min(map(max, files_by_number.values()))
+    clips = {name: _images(folder) for name, folder in folders.items()}
+    for name, files in clips.items():
+        check_counting(folders[name], [*files], [file.name for file in files.values()])
+    first = max(map(min, clips.values()))
+    last = min(map(max, clips.values()))
     if first > last:
         raise ValueError(
-            f"{folders[0].parent}: expected cameras with numbers of images that overlap, got one "
-            f"that ends with {last} and one that begins with {first}; pair their images by "
-            "position with --offset in place of --gaps, or leave one out with --exclude."
+            f"{next(iter(folders.values())).parent}: expected cameras with numbers of images that "
+            f"overlap, got one that ends with {last} and one that begins with {first}; pair their "
+            "images by position with --offset in place of --gaps, or leave one out with --exclude."
         )
-    numbers = sorted(set().union(*files_by_number.values()))
+    numbers = sorted(set().union(*clips.values()))
     steps = np.diff(numbers)
     step = math.gcd(*steps.tolist()) or 1
     if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
         gap = int(np.argmax(steps))
-        clips = files_by_number.values()
-        file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
+        file = next(f[numbers[gap + 1]] for f in clips.values() if numbers[gap + 1] in f)
         raise ValueError(
             f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
             "remove or renumber it."
         )
     timestamps = range(numbers[0], numbers[-1] + 1, step)
-    readers: dict[Path, FolderReader] = {}
-    for folder, files in files_by_number.items():
+    readers: dict[str, FolderReader] = {}
+    for name, files in clips.items():
         suffix = next(iter(files.values())).suffix
-        images = [files.get(n, folder / f"{n:04d}{suffix}") for n in timestamps]
-        readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
+        images = [files.get(n, folders[name] / f"{n:04d}{suffix}") for n in timestamps]
+        readers[name] = replace(FolderReader.of_files(images, gaps=True), numbers=timestamps)
     return readers
 
 
