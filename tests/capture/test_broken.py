@@ -190,7 +190,7 @@ NERFSTUDIO = {
             path,
             lambda m: [m.pop("w"), *(f.update(file_path="a.png") for f in m["frames"])],
         ),
-        "expected `w` and `h`, or an image of their size, found none; copy the images",
+        "expected clips named after its cameras a.png, a.png, a.png, found cam1, cam2, cam10",
     ),
     "angle": (
         transforms(lambda m: [m.update(camera_angle_x=0), *(f.pop("fl_x") for f in m["frames"])]),

@@ -220,37 +220,20 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     return matches.pop() if len(matches) == 1 else None
 
 
-def clip_of_image(folder: Path, image: str, clips: Mapping[str, Clip]) -> Clip | None:
-    """Return the file or the clip of an image, None if it has neither.
-
-    Args:
-        folder: the folder of the calibration, from which the image is named.
-        image: its name.
-        clips: clips by name, for images that are no files.
-    """
-    file = folder / image.replace("\\", "/")
-    if not file.is_file() and file.parent.is_dir():  # a name without the suffix
-        name = composed(file.name)
-        others = images_in(file.parent)
-        file = next((f for f in others if name in map(composed, (f.stem, f.name))), file)
-    if file.is_file():
-        return file
-    name = view_of_image(clips, image, by_folder=True)
-    return None if name is None else clips[name]
-
-
 def size_of_clip(clip: Clip) -> tuple[int, int]:
-    """Return the width and height of a clip or of an image file.
+    """Return the width and height of a clip by its video or its first image.
 
     Raises:
         ValueError: it cannot be read.
     """
-    if isinstance(clip, Path) and clip.is_file() and clip.suffix.lower() not in VIDEO_SUFFIXES:
-        size = imagesize.get(clip)
-        if min(size) > 0:
-            return size
-        clip = (clip,)  # its header does not show its size
-    reader = open_frames(clip)
+    file = clip if isinstance(clip, Path) else clip[0]
+    if file.is_dir():
+        file = images_in(file)[0]
+    is_video = file.suffix.lower() in VIDEO_SUFFIXES
+    size = (-1, -1) if is_video else imagesize.get(file)
+    if min(size) > 0:
+        return size
+    reader = open_frames(file if is_video else (file,))  # the header does not show the size
     return reader.width, reader.height
 
 

@@ -28,7 +28,7 @@ from morgs_mi.capture.layouts.calibration import (
     match_clips,
     required_clips,
 )
-from morgs_mi.capture.layouts.clips import clip_of_image, size_of_clip
+from morgs_mi.capture.layouts.clips import size_of_clip
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, intrinsic_matrix, rigid
 from morgs_mi.io.clip_readers import Clip
@@ -219,14 +219,7 @@ def _read_images(
     )
     keys = set().union(meta, *frames)
     if frames and not {"w", "h"} <= keys:
-        files = (clip_of_image(path, str(frame.get("file_path")), clips) for frame in frames)
-        file = next(filter(None, files), None)
-        if file is None:
-            raise FileNotFoundError(
-                f"{source}: expected `w` and `h`, or an image of their size, found none; copy the "
-                "images, or remove this file."
-            )
-        meta["w"], meta["h"] = size_of_clip(file)
+        meta["w"], meta["h"] = size_of_clip(next(iter(clips.values())))
     warn_unread(source, keys - _KEYS - _HARMLESS)
     images = []
     for index, frame in enumerate(frames):
