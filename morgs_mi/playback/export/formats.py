@@ -20,24 +20,16 @@ class Format:
     default: str
     #: Whether it is a folder with a file per frame, or one for a web server.
     folder: bool = False
-    ending: str = ""  #: End of the names of such folders; empty: of any name without a suffix.
+    endings: tuple[str, ...] = ()  #: Ends of the names of such folders; none: no suffix.
 
     def is_file(self, output: str | Path) -> bool:
         """Return whether an output of this format is a file."""
-        return not self.folder or self._is_named(output)
-
-    def matches(self, output: str | Path) -> bool:
-        """Return whether an output is named like one of this format."""
-        name = Path(output).name.lower()
-        return self._is_named(output) or (self.ending != "" and name.endswith(self.ending))
-
-    def _is_named(self, output: str | Path) -> bool:
-        return bool(self.name) and Path(output).name.lower().endswith(f".{self.name}")
+        return not self.folder or Path(output).name.lower().endswith(f".{self.name}")
 
 
 PLY = (
     Format("ply", "ply", folder=True),
-    Format("compressed.ply", "compressed-ply", folder=True, ending="compressed-ply"),
+    Format("compressed.ply", "compressed-ply", folder=True, endings=("compressed-ply",)),
 )
 GLTF = (Format("glb", "gltf", folder=True),)
 USD = tuple(Format(name, f"stream.{name}") for name in ("usdc", "usd", "usda", "usdz"))
@@ -46,8 +38,8 @@ WEB = (Format("html", "player.html"), Format("", "web", folder=True))
 SHEET = (Format("png", "{}.png"),)
 IMAGES = (
     *VIDEO,
-    Format("exr", "{}-exr", folder=True, ending="exr"),
-    Format("png", "{}-png", folder=True, ending="png"),
+    Format("exr", "{}-exr", folder=True, endings=("exr",)),
+    Format("png", "{}-png", folder=True, endings=("png",)),
 )
 
 
@@ -62,18 +54,20 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
     """
     if output is None:
         return formats[0]
-    if matches := [choice for choice in formats if choice.matches(output)]:
-        return max(matches, key=lambda choice: len(choice.name))
-    suffix = re.search(r"\.[a-z]\w*$", name := Path(output).name.lower())
+    name = Path(output).name.lower()
+    for choice in sorted(formats, key=lambda choice: len(choice.name), reverse=True):
+        if name.endswith((f".{choice.name}", *choice.endings)):
+            return choice
+    suffix = re.search(r"\.[a-z]\w*$", name)
     folders = [choice for choice in formats if choice.folder]
     if suffix is None and folders:
         return folders[0]
     names = [f"FILE.{choice.name}" for choice in formats if choice.name]
-    endings = [choice.ending and f" ending in {choice.ending}" for choice in folders]
-    expected = " or ".join([*names, *(f"a folder{ending}" for ending in endings)])
+    names += [" ending in ".join(("a folder", *choice.endings)) for choice in folders]
     raise ValueError(
-        f"{output}: the output must be {expected}, got {suffix[0] if suffix else name!r}; name "
-        "such a one, and convert it by another program, such as ffmpeg for videos."
+        f"{output}: the output must be {' or '.join(names)}, got "
+        f"{suffix[0] if suffix else name!r}; name such a one, and convert it by another program, "
+        "such as ffmpeg for videos."
     )
 
 
