@@ -15,6 +15,7 @@ from morgs_mi.io.clip_readers import FrameReader
 from morgs_mi.io.exr import opaque_light
 from morgs_mi.io.images import FolderReader, decode_image
 from morgs_mi.io.listing import existing_file
+from morgs_mi.platform.checks import few
 
 
 def used_in_clip(
@@ -50,15 +51,14 @@ def used_in_clip(
             )
         used_mask &= scaled_mask(mask, width, height)
     if not used_mask.all():
-        several = f": all that any of {len(files)} masks has black"
-        origin = several if len(files) > 1 else f" by {files[0].name}"
-        notes.append(f"{name}: {_unused(used_mask)} % of its pixels are masked out{origin}.")
+        masks = few([file.name for file in files], 3)
+        notes.append(f"{name}: {_unused(used_mask)} % of its pixels are masked out by {masks}.")
     if opaque is not None:
         used_mask &= opaque
     if not used_mask.any():
         raise ValueError(
-            f"{files[0] if files else reader.path}: expected pixels of {name} that are used, got "
-            "all black or transparent; correct the mask."
+            f"{reader.path}: expected pixels of {name} that are used, got all black in a mask or "
+            "transparent; correct the mask."
         )
     return None if used_mask.all() else used_mask, notes
 

@@ -49,9 +49,10 @@ EXAMPLE = (
 _OTHER_IMAGES = {"alpha", "depth", "depths", "infrared", "ir", "mask", "normal", "normals"}
 _NOT_CLIPS = {"sparse", "truth", "masks", "seg", *_OTHER_IMAGES}
 # Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
-_COPIES = re.compile(r"images_[0-9]+")
+_COPIES = r"images_[0-9]+"
 _COLORS = ("images", "color", "rgb")
-_NOT_CAMERAS = re.compile("|".join((*_NOT_CLIPS, "frames", *_COLORS, _COPIES.pattern)))
+_NOT_PLACES = re.compile("|".join((*_NOT_CLIPS, "frames", _COPIES)))
+_NOT_CAMERAS = re.compile("|".join((_NOT_PLACES.pattern, *_COLORS)))
 _USUAL = {"images", "videos"}
 
 
@@ -121,9 +122,7 @@ def _by_rig(path: Path, clips: Callable[[Path], dict[str, _Clip]]) -> dict[str, 
 
 def _places(path: Path) -> list[Path]:
     """Return the folders in a capture in which clips are looked for, the usual ones last."""
-    inner = [f for f in listed(path) if f.is_dir() and f.name not in {*_NOT_CLIPS, "frames"}]
-    if (path / "images").is_dir():
-        inner = [f for f in inner if not _COPIES.fullmatch(f.name)]
+    inner = [f for f in listed(path) if f.is_dir() and not _NOT_PLACES.fullmatch(f.name)]
     return sorted(inner, key=lambda f: f.name in _USUAL)
 
 
