@@ -207,10 +207,9 @@ def _by_numbers(
     """Return the clocks of clips by the numbers of their images, too, the number of timestamps per
     second, and a sentence for each assumption.
     """
-    readers = {name: clock.reader for name, clock in clocks.items()}
-    numbers = {name: clip.numbers for name, clip in readers.items() if clip.numbers is not None}
-    moving = any(len(clip) > 1 for clip in numbers.values())
-    if not moving or len({(clip[0], clip.step) for clip in numbers.values()}) == 1:
+    folders = {name: clock.reader.numbers or () for name, clock in clocks.items()}
+    numbers = {name: clip for name, clip in folders.items() if len(clip) > 1}
+    if len({(clip[0], clip.step) for clip in numbers.values()}) < 2:
         return clocks, fps, []
     table = ", ".join(f"{name} {_range(clip)}" for name, clip in numbers.items())
     if config.offset and not config.trim:

@@ -20,7 +20,7 @@ from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.platform.bounded import JsonObject, read_json
-from morgs_mi.platform.checks import LARGEST, view_index
+from morgs_mi.platform.checks import LARGEST, require, view_index
 from morgs_mi.platform.config import Config, apply_values, check_value, types_of
 from morgs_mi.platform.files import CAPTURE, REPORT, STREAM
 from morgs_mi.playback.default_rig import BOX
@@ -211,22 +211,20 @@ def open_stream_capture(
         {camera.name: camera.size for camera in cameras}
         for cameras in (stream.cameras, recording.cameras)
     )
-    if recorded_sizes == sizes and test_view != "auto":
-        recording = recording.holding_out(test_view)
-    problem = None
-    if recorded_sizes != sizes:
-        problem = f"the cameras {recorded_sizes}, not {sizes}"
-    elif not frames or frames != list(range(frames[0], min(stop, recording.num_frames))):
-        problem = f"{recording.num_frames} frames, not all of {shortened(frames)}"
-    elif mark is not None and not any_recording:
+    expected = f"expected the recording that {stream.path} was fitted to"
+    remedy = "pass that capture (--capture), or compare with any recording (--any-recording)"
+    cameras = f"the cameras {recorded_sizes}, not {sizes}"
+    require(recorded_sizes == sizes, path, expected, cameras, remedy)
+    span = list(range(min(frames, default=0), min(stop, recording.num_frames)))
+    number = f"{recording.num_frames} frames, not all of {shortened(frames)}"
+    require(frames and frames == span, path, expected, number, remedy)
+    if mark is not None and not any_recording:
         images = next(recording.partial_frames(0, 1)).images
-        if fingerprint(recording, images, refines) != mark:
-            problem = "other images in its first frame, or other points"
-    if problem is not None:
-        raise ValueError(
-            f"{path}: expected the recording that {stream.path} was fitted to, got {problem}; pass "
-            "that capture (--capture), or compare with any recording (--any-recording)."
-        )
+        same = fingerprint(recording, images, refines) == mark
+        others = "other images in its first frame, or other points"
+        require(same, path, expected, others, remedy)
+    if test_view != "auto":
+        recording = recording.holding_out(test_view)
     # Other refined cameras change no image, and ground truth refers to the recording's cameras.
     if recording.display_exposure is not None:
         recording = replace(recording, display_exposure=stream_exposure(stream))
