@@ -54,7 +54,7 @@ class Render:
     camera: Annotated[str | None, optional("CAMERA")] = None
     """Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A
     file of Gaussians has front, front-right, right, back-right, back, back-left, left and
-    front-left, or the cameras of its training. By default, a single image is seen by the first
+    front-left. By default, a single image is seen by the first
     camera; for a file, by the one with most detail in view. all: thumbnails of the first frame in
     colour, with the names of the cameras, in FILE.png, by default all.png beside the stream.
     """

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from morgs_mi.cli.console import print_result, print_warning, progress
+from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import options
 from morgs_mi.platform.progress import Progress, Report, duration
 from morgs_mi.playback.default_rig import DEFAULT_RIG
@@ -66,7 +66,7 @@ def on_background(stream: FrameSource, color: str | None) -> None:
 def opened(
     out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False
 ) -> FrameSource:
-    """Return the stream that a command reads, and print which cameras a file of Gaussians has.
+    """Return the stream that a command reads.
 
     Args:
         out: folder of a fit, a stream file, or a file of Gaussians.
@@ -78,12 +78,9 @@ def opened(
     Raises:
         FileNotFoundError, ValueError: as for `open_stream`.
     """
-    from morgs_mi.playback.streams import DRAWN, SplatFile, open_stream
+    from morgs_mi.playback.streams import DRAWN, open_stream
 
-    stream = open_stream(out, 1.0 if drop_invalid else DRAWN if drawn else 0.0, skip_damaged)
-    if drawn and isinstance(stream, SplatFile) and stream.cameras_file is not None:
-        print_warning(f"Cameras: {stream.cameras_file}.")
-    return stream
+    return open_stream(out, 1.0 if drop_invalid else DRAWN if drawn else 0.0, skip_damaged)
 
 
 def print_view(stream: FrameSource, choice: str | None, more: str = "") -> None:

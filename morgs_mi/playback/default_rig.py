@@ -1,45 +1,26 @@
-"""Cameras for Gaussians without a recording: their training cameras, or a ring around them.
+"""Cameras for Gaussians without a recording: a ring around them.
 
-Nothing in a `cameras.json` names its Gaussians. It may be of another scene in the same folder, or
-of the same scene before it was moved or scaled.
-
-Gaussians of other tools have no cameras, and do not state which direction is up. What a camera
-should see is a box. Along each axis it holds the middle 90 % of the centres, weighted by opacity:
-floaters and a far background do not count. Where next to nothing lies far outside of that box, the
-Gaussians are a single object, and the box holds all of it. Captured scenes have a side from which
-they were seen: there the images have the most detail.
-
-Cameras of a training run of 3D Gaussian Splatting, from the `cameras.json` in the folder of its
-model.
-
-A model has `cameras.json` and `point_cloud/iteration_30000/point_cloud.ply`. The file is a list of
-objects with `img_name`, `width`, `height`, `position` [3], `rotation` [3][3] (camera to world, x
-right, y down, z forward), `fx` and `fy` in pixels; the principal point is the middle of the image.
+Gaussians of other tools do not state which direction is up. What a camera should see is a box.
+Along each axis it holds the middle 90 % of the centres, weighted by opacity: floaters and a far
+background do not count. Where next to nothing lies far outside of that box, the Gaussians are a
+single object, and the box holds all of it. Captured scenes have a side from which they were seen:
+there the images have the most detail.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import seen_points, with_near_planes
-from morgs_mi.platform.bounded import read_json, warn_unread
-from morgs_mi.platform.checks import errors_at
 from morgs_mi.render.rasterize import rasterize
 
-_KEYS = {"width", "height", "position", "rotation", "fx", "fy"}
-_HARMLESS = {"id", "img_name", "image_name", "name", "near", "far"}
-# Cameras that are kept, evenly spaced in the file: more are of no use to a viewer.
-_MOST_CAMERAS = 48
 Axes = Literal["y-down", "y-up", "z-up"]
 """Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's
 axes, y down.
@@ -69,43 +50,6 @@ _OBJECT_REACH = 0.25
 _PERCENT_OF_STRAYS = 0.1  # of the weight of an object, on each side
 _MARGIN = 1.05
 _LEAST_EXTENT = 1e-6  # of the distance from the origin
-# Share of the Gaussians, weighted by opacity, that all cameras together see at least.
-_LEAST_SEEN = 0.03
-# Extent of what a camera sees, in widths of its image: below, the scene is a dot.
-_LEAST_EXTENT_SEEN = 0.03
-_LOG = logging.getLogger(__name__)
-
-
-def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
-    """Return the `cameras.json` that may belong to a file of Gaussians, and its cameras; None and
-    none without one.
-
-    The file is beside the Gaussians or in one of the two folders above. At most 48 cameras are
-    returned. Nothing in it names the Gaussians: it may be of another scene.
-
-    Raises:
-        ValueError: an entry is broken.
-    """
-    files = (folder / "cameras.json" for folder in path.resolve().parents[:3])
-    file = next(filter(Path.is_file, files), None)
-    rows = [] if file is None else read_json(file)
-    if file is None or not isinstance(rows, list) or not all(map(_is_camera, rows)):
-        return None, ()
-    warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
-    cameras = []
-    for i in range(0, len(rows), -(-len(rows) // _MOST_CAMERAS) or 1):
-        row = rows[i]
-        with errors_at(f"{file}: entry {i}: expected a camera, got a broken one"):
-            R, position = (np.asarray(row[key], float) for key in ("rotation", "position"))
-            width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
-            K = intrinsic_matrix(fx, fy, width / 2, height / 2)
-            name = str(row.get("img_name", i))
-            cameras.append(Camera(K, pose_at(R.T, position), round(width), round(height), name))
-    return file, tuple(cameras)
-
-
-def _is_camera(row: object) -> bool:
-    return isinstance(row, dict) and row.keys() >= _KEYS
 
 
 def scene_box(frames: Sequence[Gaussians]) -> np.ndarray:
@@ -194,48 +138,3 @@ def thinned(gaussians: Gaussians) -> Gaussians:
     k = len(gaussians) // _MOST + 1
     some = gaussians.select(np.arange(0, len(gaussians), k))
     return replace(some, log_scales=some.log_scales + 0.5 * np.log(k))
-
-
-def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tuple[Camera, ...]]:
-    """Return the cameras with which a file of Gaussians was trained, and the file that has them.
-
-    Args:
-        path: the file.
-        gaussians: its Gaussians.
-
-    Returns:
-        None and no cameras where no `cameras.json` belongs to the Gaussians.
-
-    Raises:
-        ValueError: an entry of the `cameras.json` is broken.
-    """
-    file, cameras = model_cameras(path)
-    if not cameras or not len(gaussians):
-        return None, ()
-    some = thinned(gaussians)
-    cameras = with_near_planes(cameras, some.numpy()["means"])
-    visible = np.any([_seen(some, camera) for camera in cameras], axis=0)
-    opacities = np.asarray(some.opacities, np.float64)
-    share = opacities[visible].sum() / opacities.sum()
-    if share >= _LEAST_SEEN:
-        return file, cameras
-    _LOG.warning(
-        "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to be "
-        "of another scene; the cameras are a ring around the Gaussians instead.",
-        file,
-        100 * share,
-        path.name,
-    )
-    return None, ()
-
-
-def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Return which of N Gaussians a camera sees, bool [N]: none that are a dot in its image."""
-    raw = gaussians.numpy()
-    visible, pixels, depths = seen_points(camera, raw["means"])
-    if not visible.any():
-        return visible
-    with np.errstate(all="ignore"):
-        sizes = np.exp(raw["log_scales"][visible].max(axis=1, initial=-69))
-        extent = np.ptp(pixels, axis=0).max() + 2 * np.median(camera.K[0, 0] * sizes / depths)
-    return visible & (extent >= _LEAST_EXTENT_SEEN * camera.width)

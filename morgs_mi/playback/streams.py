@@ -19,7 +19,7 @@ from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.platform.checks import errors_at, few, quantity, require
 from morgs_mi.platform.files import PROVISIONAL, STREAM
-from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, default_rig, scene_box, trained_cameras
+from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, default_rig, scene_box
 from morgs_mi.playback.export.web import stream_html
 
 DRAWN = 0.5
@@ -41,14 +41,11 @@ class SplatFile(FrameSource):
     """File with the Gaussians of one frame, of any tool; they are rounded only where it is coded
     into a packet.
 
-    Its cameras are the training cameras, if it has any (see `trained_cameras`), or a `default_rig`.
+    Its cameras are a `default_rig`.
 
     Args:
         path: ``.ply``, ``.compressed.ply`` or ``.splat``.
         most_invalid: share of Gaussians with invalid numbers that are left out with a warning.
-
-    Attributes:
-        cameras_file: the `cameras.json` with its cameras; None: they are a `default_rig`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -57,16 +54,12 @@ class SplatFile(FrameSource):
 
     def __init__(self, path: Path, most_invalid: float = DRAWN) -> None:
         gaussians = read_splats(path, most_invalid)
-        self.cameras_file, trained = trained_cameras(path, gaussians)
+        with errors_at(path):
+            box = scene_box([gaussians])
         self.path = path
         self.fps = 30.0
-        self.metadata = {"num_frames": 1, DEFAULT_RIG: not trained}
-        self.cameras = trained
-        if not trained:
-            with errors_at(path):
-                box = scene_box([gaussians])
-                self.cameras = default_rig([gaussians], box)
-            self.metadata[BOX] = box.tolist()
+        self.metadata = {"num_frames": 1, DEFAULT_RIG: True, BOX: box.tolist()}
+        self.cameras = default_rig([gaussians], box)
         motion = np.zeros((len(gaussians), 3), np.float32)
         ids = np.arange(len(gaussians), dtype=np.uint32)
         self._state = FrameState(0, ids, replace(gaussians, motion=motion))

@@ -2,8 +2,6 @@
 files.
 """
 
-import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi import Camera
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.codec.reader import StreamReader
@@ -27,8 +24,7 @@ from morgs_mi.render.rasterize import rasterize
 from morgs_mi.testing import assert_close
 from tests.cli.commands import assert_refused
 from tests.cli.conftest import run
-from tests.scenes.cameras import look_at_cameras
-from tests.scenes.changing_splats import rig, splats
+from tests.scenes.changing_splats import splats
 
 MESH = """ply
 format ascii 1.0
@@ -79,63 +75,6 @@ def test_splat_file__is_coded_like_any_keyframe(file, tmp_path):
     packet = keyframe_packet(read_splats(file), 0, stream.cameras)
     assert_array_equal(written.seek(0).digest, decode(None, packet).digest)
     assert [written_packet.encoded for written_packet in written] == [packet.encoded]
-
-
-def write_model(folder, cameras, **change):
-    """Write a model as a training run does, and return its Gaussians."""
-    path = folder / "point_cloud" / "iteration_7" / "point_cloud.ply"
-    path.parent.mkdir(parents=True)
-    write_ply(path, splats())
-    rows = [
-        {
-            "id": i,
-            "img_name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
-            "position": camera.position.tolist(),
-            "rotation": camera.viewmat[:3, :3].T.tolist(),
-            "fx": camera.K[0, 0],
-            "fy": camera.K[1, 1],
-            **change,
-        }
-        for i, camera in enumerate(cameras)
-    ]
-    (folder / "cameras.json").write_text(json.dumps(rows))
-    return path
-
-
-def test_splat_file__of_a_model_has_the_cameras_of_its_training(tmp_path, run):
-    path = write_model(tmp_path, rig())
-    stream = open_stream(path)
-    assert [camera.name for camera in stream.cameras] == ["left", "middle", "right"]
-    assert stream.metadata["default_rig"] is False
-    for stream_camera, camera in zip(stream.cameras, rig(), strict=True):
-        assert_close(stream_camera.viewmat, camera.viewmat, atol=1e-12)
-        assert_close(stream_camera.K, camera.K, atol=1e-12)
-    status, _, error = run("render", path, tmp_path / "a.png", "--camera", "middle")
-    assert (status, error) == (0, f"Cameras: {tmp_path}/cameras.json.\n")
-    assert cv2.imread(str(tmp_path / "a.png")).shape == (48, 64, 3)
-
-
-def test_splat_file__of_a_model_keeps_some_of_many_cameras(tmp_path):
-    names = [camera.name for camera in open_stream(write_model(tmp_path, 50 * rig())).cameras]
-    assert len(names) == 38
-    assert names[:3] == ["left", "middle", "right"]
-
-
-def test_splat_file__ignores_other_files_of_that_name(tmp_path):
-    write_ply(tmp_path / "scene.ply", splats())
-    for content in ('{"cameras": 3}', "[]", '[{"name": "cam00"}]'):
-        (tmp_path / "cameras.json").write_text(content)
-        assert open_stream(tmp_path / "scene.ply").metadata["default_rig"] is True
-
-
-@pytest.mark.parametrize("change", [{"rotation": [[1, 0], [0, 1]]}, {"position": None}])
-def test_splat_file__of_a_model_names_a_broken_camera(tmp_path, change):
-    with pytest.raises(
-        ValueError, match=r"cameras\.json: entry 0: expected a camera, got a broken one"
-    ):
-        open_stream(write_model(tmp_path, rig(), **change))
 
 
 def test_render__draws_a_file_of_gaussians(tmp_path, run):
@@ -203,45 +142,6 @@ def test_splat_file__without_gaussians_is_named(tmp_path):
     write_ply(tmp_path / "scene.ply", splats(0))
     with pytest.raises(ValueError, match=r"scene\.ply: expected at least one Gaussian, got none"):
         open_stream(tmp_path / "scene.ply")
-
-
-def ring(center, count=6):
-    """Return cameras on a circle that look at its centre."""
-    angles = 2 * np.pi * np.arange(count) / count
-    origins = [np.add(center, (5 * np.sin(a), 0, -5 * np.cos(a))) for a in angles]
-    return look_at_cameras(
-        origins, 45, 64, 48, [f"{i:05d}" for i in range(count)], target=center, up=(0, -1, 0)
-    )
-
-
-OTHER_SCENES = {
-    "far away": ring((300, 0, 0)),
-    "looking away": [
-        Camera.look_at((0, 0, 3), (x, 0, 9), (0, -1, 0), 45, 64, 48, f"{x}") for x in (-1, 0, 1)
-    ],
-}
-
-
-@pytest.mark.parametrize("kind", OTHER_SCENES)
-def test_splat_file__has_a_ring_where_the_cameras_are_of_another_scene(tmp_path, kind, caplog, run):
-    path = write_model(tmp_path, OTHER_SCENES[kind])
-    stream = open_stream(path)
-    assert (len(stream.cameras), stream.metadata["default_rig"], stream.cameras_file) == (
-        8,
-        True,
-        None,
-    )
-    assert re.search(
-        r"cameras\.json: its cameras see 0\.0 % of the Gaussians of point_cloud\.ply", caplog.text
-    )
-    assert run("render", path, tmp_path / "a.png", "--width", 64)[0] == 0
-    assert cv2.imread(str(tmp_path / "a.png")).max() > 0
-
-
-def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
-    path = write_model(tmp_path, rig())
-    write_ply(path, splats(1))
-    assert open_stream(path).cameras_file == tmp_path / "cameras.json"
 
 
 def with_nan(path, rows):
