@@ -295,8 +295,10 @@ def _spread(clips: Mapping[str, ClipTimes], clocks: _Clocks) -> float:
     timestamps.
     """
     times = np.array([clocks[name].timestamp(clip.positions) for name, clip in clips.items()])
-    times[np.array([clip.frame_indices < 0 for clip in clips.values()])] = np.nan  # no image
-    return float(np.fmax.reduce(np.fmax.reduce(times) - np.fmin.reduce(times), initial=0))
+    missing = np.array([clip.frame_indices < 0 for clip in clips.values()])
+    latest = np.where(missing, -np.inf, times).max(axis=0)
+    earliest = np.where(missing, np.inf, times).min(axis=0)
+    return float(np.max(latest - earliest, initial=0))
 
 
 def _without_drift(clocks: _Clocks, max_frames: int | None) -> _Clocks:
