@@ -24,7 +24,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
-from morgs_mi.platform.config import apply_values, read_config, relocated
+from morgs_mi.platform.config import apply_values, read_config
 from morgs_mi.platform.documentation import field_docs, with_pages
 
 # The setting of every option. All others are set in a file.
@@ -268,16 +268,9 @@ class Settings:
         from morgs_mi.method.motion_model import MOTION_MODELS
 
         motion = config.motion
-        try:
-            FLOW_SOURCES.make(motion.flow_method, motion.flow)
-            MASK_REFINERS.make(motion.mask_method, motion.masks)
-            MOTION_MODELS.make(motion.model, motion)
-        except ValueError as error:
-            names = {"motion.flow_method", "motion.mask_method", "motion.model"} - {*self.given()}
-            if self.config is None or not names:
-                raise
-            fields = [name.removeprefix("motion.") for name in names]
-            raise relocated(error, self.config, "motion.", fields) from None
+        FLOW_SOURCES.make(motion.flow_method, motion.flow)
+        MASK_REFINERS.make(motion.mask_method, motion.masks)
+        MOTION_MODELS.make(motion.model, motion)
 
 
 # As fields of a command: options without a prefix. None means "not given", so it cannot be passed.

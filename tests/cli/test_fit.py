@@ -99,7 +99,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
         ),
         (
             ["--config", "[motion]\nflow_method = 'no'"],
-            ("bad.toml: `motion.flow_method` must be one of dis,",),
+            ("`motion.flow_method` must be one of dis,",),
         ),
         (
             ["--variant", "cuda_ad_rgb"],

@@ -150,7 +150,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
 def write_colmap(
     folder: str | Path,
     cameras: Sequence[Camera],
-    points: np.ndarray | None = None,
+    points: np.ndarray = NO_POINTS,
     point_colors: np.ndarray | None = None,
     lenses: Sequence[Lens] | None = None,
 ) -> None:
@@ -160,7 +160,7 @@ def write_colmap(
         folder: created if missing.
         cameras: the views; the image of a view is called `name`, with ``.png`` added if it has no
             suffix.
-        points: [P, 3] world units, or None for no points.
+        points: [P, 3] world units; none by default.
         point_colors: [P, 3] in [0, 1]; grey if None.
         lenses: one per camera, as in `ColmapModel`; pinholes if None.
 
@@ -169,7 +169,7 @@ def write_colmap(
     """
     folder = Path(folder)
     lenses = [Lens()] * len(cameras) if lenses is None else lenses
-    points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
+    points = np.asarray(points, np.float64)
     colors = np.full(points.shape, 0.5) if point_colors is None else np.asarray(point_colors)
     colors = np.rint(np.clip(colors, 0, 1) * 255).astype(int)
     image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points\n"]
