@@ -4,6 +4,7 @@ them out.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +17,10 @@ from morgs_mi.io.exr import opaque_light
 from morgs_mi.io.images import FolderReader, decode_image
 from morgs_mi.io.listing import existing_file
 from morgs_mi.platform.checks import few
+
+# Headers of images without an alpha channel: JPEG, BMP, whose alpha channel is no mask, and PNG in
+# grey (colour type 0) or RGB (2).
+_OPAQUE = re.compile(rb"\xff\xd8|BM|\x89PNG.{21}[\0\2]", re.DOTALL)
 
 
 def used_in_clip(
@@ -93,14 +98,9 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     with suppress(ValueError, OSError):
         with file.open("rb") as stream:
             header = stream.read(26)
-        # JPEG has no alpha channel, and the one of BMP is no mask. PNG may have one if its colour
-        # type is 3 (palette), 4 (grey and alpha) or 6 (RGB and alpha).
-        has_none = header.startswith((b"\xff\xd8", b"BM")) or (
-            header.startswith(b"\x89PNG") and header[25:] not in (b"\3", b"\4", b"\6")
-        )
         if header.startswith(b"\x76\x2f\x31\x01"):
             mask = opaque_light(file)
-        elif not has_none:
+        elif not _OPAQUE.match(header):
             image = decode_image(file, cv2.IMREAD_UNCHANGED)
             if image.shape[2:] == (4,):
                 mask = image[..., 3] == np.iinfo(image.dtype).max
