@@ -180,25 +180,31 @@ class VideoReader(Frames):
 
     def _numbered(self, first: int) -> Generator[tuple[int, av.VideoFrame], None, None]:
         """Yield the frames with their indices, from `first` or earlier."""
-        stamps = self.stamps
-        far = stamps is not None and FAR <= first < len(stamps)
-        for begin in (first - _BEFORE, 0) if far else (0,):
-            # All frames are missing if the file has vanished since it was opened.
-            with suppress(FileNotFoundError, ValueError), _opened(self.path) as (container, stream):
-                if stamps is not None and begin:
-                    container.seek(int(stamps[begin]), stream=stream)
-                packets = _unbroken(partial(container.demux, stream))
-                frames = (frame for packet in packets for frame in _unbroken(packet.decode))
-                numbered = enumerate(frames)
-                if stamps is not None:
-                    # A frame of a damaged packet is none of those that the file holds.
-                    indices = {int(stamp): index for index, stamp in enumerate(stamps)}
-                    numbered = ((indices[f.pts], f) for f in frames if f.pts in indices)
-                head = next(numbered, None)
-                if head is not None and (head[0] <= first or not begin):
+        if self.stamps is not None and FAR <= first < len(self.stamps):
+            with closing(self._decoded(int(self.stamps[first - _BEFORE]))) as frames:
+                head = next(frames, None)
+                if head is not None and head[0] <= first:
                     yield head
-                    yield from numbered
+                    yield from frames
                     return
+        yield from self._decoded()
+
+    def _decoded(
+        self, begin: int | None = None
+    ) -> Generator[tuple[int, av.VideoFrame], None, None]:
+        """Yield the frames with their indices, from a keyframe at the time `begin` or earlier."""
+        # All frames are missing if the file has vanished since it was opened.
+        with suppress(FileNotFoundError, ValueError), _opened(self.path) as (container, stream):
+            if begin is not None:
+                container.seek(begin, stream=stream)
+            packets = _unbroken(partial(container.demux, stream))
+            frames = (frame for packet in packets for frame in _unbroken(packet.decode))
+            if self.stamps is None:
+                yield from enumerate(frames)
+                return
+            # A frame of a damaged packet is none of those that the file holds.
+            indices = {int(stamp): index for index, stamp in enumerate(self.stamps)}
+            yield from ((indices[frame.pts], frame) for frame in frames if frame.pts in indices)
 
 
 @dataclass(frozen=True)
