@@ -259,13 +259,14 @@ def match_clips(
     match = _frames_of_cameras(source, match)
     views = []
     for name in sorted(match.images, key=natural_key):
-        first, *_ = images = tuple(match.images[name])
+        frames = match.images[name]
+        files = {*masks.get(name, ())}.union(*(frame.masks for frame in frames))
         view = CalibratedView(
-            replace(first.camera, name=name),
-            first.lens,
-            tuple(sorted({*masks.get(name, ())}.union(*(image.masks for image in images)))),
+            replace(frames[0].camera, name=name),
+            frames[0].lens,
+            tuple(sorted(files)),
             clip=match.clips[name],
-            images=images,
+            images=tuple(frames),
         )
         views.append(view)
     return Calibration(tuple(views), unused=unused)
