@@ -28,13 +28,11 @@ from morgs_mi.capture.layouts.calibration import (
     required_clips,
 )
 from morgs_mi.capture.layouts.colmap_files import (
-    binary_cameras,
-    binary_images,
-    binary_points,
     count_images,
-    text_cameras,
-    text_images,
-    text_points,
+    model_file,
+    read_cameras,
+    read_images,
+    read_points,
 )
 from morgs_mi.capture.layouts.nerfstudio import read_points_ply
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
@@ -81,14 +79,11 @@ def find_models(folder: Path) -> list[Path]:
         if models or _holds_model(place):
             return models or [place]
     # In a capture itself, a single name may have another meaning.
-    is_model = any(
-        all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt")
-    )
-    return [folder] if is_model else []
+    return [folder] if all(model_file(folder, name).exists() for name in _FILES) else []
 
 
 def _holds_model(folder: Path) -> bool:
-    return any((folder / f"cameras.{kind}").exists() for kind in ("bin", "txt"))
+    return model_file(folder, "cameras").exists()
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
@@ -101,23 +96,19 @@ def read_colmap(folder: str | Path) -> ColmapModel:
             unsupported lens. Points are not checked.
     """
     folder = Path(folder)
-    is_binary = (folder / "cameras.bin").exists()
-    kind = "bin" if is_binary else "txt"
     cameras_path, images_path = (
         existing_file(
-            folder / f"{name}.{kind}", "a file of a COLMAP model", "export the whole model"
+            model_file(folder, name), "a file of a COLMAP model", "export the whole model"
         )
         for name in _FILES
     )
     intrinsics = {}
-    rows = binary_cameras(cameras_path) if is_binary else text_cameras(cameras_path)
-    for camera_id, model, *size, params in rows:
+    for camera_id, model, *size, params in read_cameras(cameras_path):
         with errors_at(f"{cameras_path}: camera {camera_id}"):
             intrinsics[camera_id] = (*lens_and_intrinsics(model, params), *size)
         check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
     images: list[CalibratedImage] = []
-    rows = binary_images(images_path) if is_binary else text_images(images_path)
-    for name, camera_id, pose in rows:
+    for name, camera_id, pose in read_images(images_path):
         with errors_at(f"{images_path}, image {name!r}"):
             if camera_id not in intrinsics:
                 raise ValueError(f"it refers to camera {camera_id}, of {few(sorted(intrinsics))}")
@@ -133,15 +124,15 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         check_claim(images_path, _CAMERA_BYTES * len(images), f"{len(images)} images")
     if not images:
         raise ValueError(f"{images_path}: expected at least one image, got none; register them.")
-    paths = (folder / f"points3D.{suffix}" for suffix in (kind, "bin", "txt", "ply"))
-    path = next((path for path in paths if path.exists()), None)
+    others = (folder / f"points3D.{suffix}" for suffix in ("bin", "txt", "ply"))
+    path = next(filter(Path.exists, (model_file(folder, "points3D"), *others)), None)
     if path is None:
         points = colors = NO_POINTS
     elif path.suffix == ".ply":
         points, colors = read_points_ply(path)
     else:
-        rows = binary_points(path) if path.suffix == ".bin" else text_points(path)
-        table = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
+        rows = np.fromiter(read_points(path), np.dtype((np.float64, 6)))
+        table = np.asarray(rows, np.float64)
         points, colors = np.hsplit(table, 2)
         colors = (colors / 255).astype(np.float32)
     return ColmapModel(tuple(images), points, colors)

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -46,12 +46,33 @@ _COUNT = "<Q"
 _MAX_CAMERA_FIELDS = 20
 
 
+def model_file(folder: Path, name: str) -> Path:
+    """Return the path of a file of a COLMAP model, which may be missing: binary if its cameras are,
+    otherwise text.
+    """
+    kind = "bin" if (folder / "cameras.bin").exists() else "txt"
+    return folder / f"{name}.{kind}"
+
+
+def read_cameras(path: Path) -> Iterator[tuple[int, str, int, int, Sequence[float]]]:
+    """Return the rows of `cameras.bin` or `cameras.txt`."""
+    return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+
+
+def read_images(path: Path) -> Iterator[tuple[str, int, Sequence[float]]]:
+    """Return the rows of `images.bin` or `images.txt`."""
+    return _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+
+
+def read_points(path: Path) -> Iterator[list[float]]:
+    """Return the rows of `points3D.bin` or `points3D.txt`."""
+    return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
+
+
 def count_images(folder: Path) -> int:
     """Return the number of images in the COLMAP model in `folder`; 0 if it cannot be read."""
-    is_binary = (folder / "cameras.bin").exists()
     with suppress(OSError, ValueError):
-        images = binary_images if is_binary else text_images
-        return sum(1 for _ in images(folder / f"images.{'bin' if is_binary else 'txt'}"))
+        return sum(1 for _ in read_images(model_file(folder, "images")))
     return 0
 
 
@@ -77,7 +98,7 @@ def _expected(record: str, path: Path, number: int, line: str) -> Iterator[None]
         ) from None
 
 
-def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
     for number, line in _lines(path):
         if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
             with _expected(_CAMERA, path, number, line):
@@ -86,7 +107,7 @@ def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]
             yield camera_id, fields[1], width, height, params
 
 
-def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
+def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
     lines = _lines(path)
     for number, line in lines:
         if not line.strip():
@@ -106,7 +127,7 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
         yield name, camera_id, pose
 
 
-def text_points(path: Path) -> Iterator[list[float]]:
+def _text_points(path: Path) -> Iterator[list[float]]:
     for number, line in _lines(path):
         if fields := line.split(maxsplit=8):
             with _expected(_POINT, path, number, line):
@@ -158,7 +179,7 @@ class _Bytes:
         return self.data[start:end].decode("utf-8", errors="replace")
 
 
-def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
     file = _Bytes(path)
     names = dict(enumerate(MODELS))
     for _ in file.records("cameras"):
@@ -168,7 +189,7 @@ def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float
         yield camera_id, name, width, height, file.take(f"<{2 + sum(MODELS.get(name, ()))}d")
 
 
-def binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
     file = _Bytes(path)
     for _ in file.records("images"):
         _, *pose, camera_id = file.take(_IMAGE_BYTES)
@@ -178,7 +199,7 @@ def binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
         yield name, camera_id, tuple(pose)
 
 
-def binary_points(path: Path) -> Iterator[list[float]]:
+def _binary_points(path: Path) -> Iterator[list[float]]:
     file = _Bytes(path)
     for _ in file.records("points"):
         _, *xyz_rgb, _, track = file.take(_POINT_BYTES)
