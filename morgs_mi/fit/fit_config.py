@@ -119,8 +119,8 @@ class CameraPriors:
 
 @config_class
 class ShortFitConfig:
-    """Settings of the short fits with which cameras are refined and balanced, and the results are
-    compared.
+    """Settings of the short fits that compare refined cameras with calibrated ones, and estimate
+    exposures.
     """
 
     gaussians: Annotated[int, Ge(4)] = 4000
@@ -128,7 +128,7 @@ class ShortFitConfig:
     steps: Annotated[int, Ge(2)] = 300
     """Steps of a fit; each further round takes half as many."""
     rounds: Count = 5
-    """Rounds of fitting Gaussians and changing the cameras."""
+    """Rounds of fitting Gaussians and changing the exposures."""
     width: Count = 320
     """Least width to which images are reduced, px."""
 
@@ -166,7 +166,7 @@ class FitConfig:
     """Estimate gain and bias of each camera and frame: off, auto (differences between the cameras
     are taken if withheld pixels show that they are real) or on (always taken)."""
     short_fits: ShortFitConfig = ShortFitConfig()
-    """Fits for the refinement of the cameras and for their exposures."""
+    """Fits that compare refined cameras, and estimate exposures."""
     confidence_steps: NonNegativeInt = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
     epochs: Count = 8

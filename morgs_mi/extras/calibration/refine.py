@@ -1,34 +1,27 @@
 """Refinement of calibrated cameras on the first frame: poses, focal lengths, principal points and
 radial distortion.
 
-Beyond the paper. With enough feature matches, bundle adjustment gives a first estimate (see
-`bundle`). Rounds then lower the difference between images and renderings. A round is a short fit of
-Gaussians, followed by Gauss-Newton steps for all cameras and the means of all Gaussians at once.
-With the blend weights w fixed, the error e = target - image of a view is linear in the shift u of a
-splat (Lucas and Kanade 1981; as in `method.motion`): with the gradient g, it becomes e + g .
-u. A Gaussian is therefore an observation of `NormalEquations` in each view, with
-
-    G = sum_x w g g' / v,    b = sum_x w e g / v,
-
-where the variance v is the mean square error times the number of pixels with similar errors.
-
-Refined cameras are evaluated on withheld pixels: blocks of every training view that no fit uses.
-Three fits from the same start are compared by the PSNR of these pixels: with the calibrated
-cameras, with the cameras of the bundle adjustment, and with the cameras after the rounds. If there
-are many sharp features, the rounds only lose accuracy.
-
-Each round removes the distortion estimated so far from the images, because Gaussians are rendered
-with pinhole cameras.
+Beyond the paper. Features of the images are matched, and bundle adjustment gives the changes of the
+cameras (see `bundle`), unless too few points are seen by a camera. Two fits from the same start are
+then compared by the PSNR of withheld pixels, blocks of every training view that no fit uses: with
+the calibrated cameras, and with the changed ones.
 
 Cameras stay in the calibration's frame of reference and keep their mean focal length (see
 `bundle`). A camera that is not refined therefore fits as before. Points move with the cameras to
 keep their projections. The held-out view keeps its calibrated camera; `register_camera` fits a
-camera to its image while the Gaussians are frozen.
+camera to its image while the Gaussians are frozen. With their blend weights w fixed, the error e =
+target - image is linear in the shift u of a splat (Lucas and Kanade 1981; as in `method.motion`):
+with the gradient g, it becomes e + g . u. A Gaussian is therefore an observation of
+`NormalEquations` with
+
+    G = sum_x w g g' / v,    b = sum_x w e g / v,
+
+where the variance v is the mean square error times the number of pixels with similar errors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -74,16 +67,11 @@ from morgs_mi.render.render_config import RenderConfig
 # A camera with features in fewer tracks is not determined by them.
 _MIN_TRACKS = 40
 # Number of pixels with similar errors, because the fit lacks a detail there. They count as one
-# pixel: otherwise priors would have no influence, and cameras would follow the errors of a short
-# fit.
+# pixel: otherwise priors would have no influence, and a camera would follow the errors of the fit.
 _ALIKE = 10.0
-# Gauss-Newton steps of a round, their damping, and the longest step of a mean in scene extents.
-_STEPS = 3
-_DAMPING = 1e-3
-_LONGEST = 0.02
-# px, standard deviations of the blur of images and gradients in the first rounds, for errors of
-# several pixels.
-_BLURS = (2.0, 1.0)
+# px, standard deviations of the blur of images and gradients, one after the other: a blurred image
+# registers errors of several pixels.
+_BLURS = (2.0, 1.0, 0.0)
 # Error at which a pixel has half its weight, relative to white: larger errors are details that the
 # fit lacks.
 _HALF_WEIGHT = 0.1
@@ -96,8 +84,6 @@ _VALID = 0.999
 # px.
 _REGISTRATION_STEPS = 30
 _LEAST_SHIFT = 1e-3
-# Factors on the learning rates in the rounds after the first.
-_LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
 
 
 @dataclass(frozen=True)
@@ -123,6 +109,11 @@ class Refinement:
             f"{self.calibrated_psnr:.2f} dB"
         )
         reason = "" if np.isnan(self.calibrated_psnr) else scores
+        if not self.tracks:
+            return (
+                "The cameras stay as calibrated: a camera shares too few features with others to "
+                "be refined."
+            )
         if not self.taken:
             return f"The cameras stay as calibrated, refined ones are no clear gain{reason}."
         sizes = (
@@ -176,7 +167,8 @@ def refine_cameras(
 
     Args:
         capture: its first frame and its points are used, without the held-out view.
-        config: settings of the fit; `refine_cameras` "on" always selects the refined cameras.
+        config: settings of the fit; `refine_cameras` "on" selects the refined cameras without a
+            comparison.
         render: cut-offs.
         seed: seed of all random choices.
         progress: called with (fits done, fits in all).
@@ -186,29 +178,18 @@ def refine_cameras(
     """
     render = config_or_default("refine_cameras()", render, RenderConfig(), "render")
     problem = _Problem.of(capture, config, render, seed)
-    deviations = prior_deviations(problem.extent, config.camera_priors)
-    bundle_changes, tracks, deviations = _matched(capture, problem.indices, deviations)
-    estimates: dict[str, np.ndarray] = {}
-    if config.refine_cameras == "auto":
-        estimates["calibration"] = np.zeros_like(bundle_changes)
-    if tracks:
-        estimates["bundle adjustment"] = bundle_changes
-    fits = config.short_fits.rounds + len(estimates) + bool(estimates)
-
-    def report(done: int) -> None:
-        if progress is not None:
-            progress(done, fits)
-
-    estimates["images"] = problem.refined(bundle_changes, deviations, report)
-    scores = {"images": float("nan")}  # a single estimate is not compared
-    if len(estimates) > 1:
-        scores = dict(zip(estimates, problem.scores([*estimates.values()], report), strict=True))
-    calibrated = scores.pop("calibration", float("nan"))
-    best = max(scores, key=lambda name: scores[name])
-    is_better = not scores[best] < calibrated + LEAST_GAIN
-    changes = estimates[best]
+    changes, tracks = problem.matched()
+    scores = [float("nan")] * 2
+    if tracks and config.refine_cameras == "auto":
+        scores = []
+        for estimate in (np.zeros_like(changes), changes):
+            if progress is not None:
+                progress(len(scores), 2)
+            scores.append(problem.score(estimate))
+    calibrated, refined = scores
+    is_better = tracks > 0 and not refined < calibrated + LEAST_GAIN
     refinement = Refinement(
-        is_better, calibrated, scores[best], tracks, *_sizes(problem.cameras, changes)
+        is_better, calibrated, refined, tracks, *_sizes(problem.cameras, changes)
     )
     return problem.changed_capture(changes) if is_better else capture, refinement
 
@@ -250,40 +231,32 @@ class _Problem:
         """The calibrated cameras at the size of the capture."""
         return [self.capture.cameras[v] for v in self.indices]
 
-    def refined(
-        self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]
-    ) -> np.ndarray:
-        """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint
-        steps.
-
-        Args:
-            changes: initial changes [V, 11].
-            deviations: standard deviations of the priors [11].
-            report: called with the number of completed fits.
+    def matched(self) -> tuple[np.ndarray, int]:
+        """Return the changes [V, 11] of the cameras by bundle adjustment, and the number of its
+        points; without enough points, there are none, and no changes.
         """
-        problem = self._begun(changes)
-        for done in range(self.config.short_fits.rounds):
-            report(done)
-            problem = replace(problem, views=tuple(_changed(self.views, changes)))
-            gaussians = self._fitted(problem, is_later=done > 0)
-            blur = _BLURS[done] if done < len(_BLURS) else 0.0
-            for _ in range(_STEPS):
-                gaussians, changes = _joint_step(
-                    gaussians, self.views, changes, deviations, blur, self.render
-                )
-            problem = replace(problem, start=gaussians)
-        return changes
+        recording = self.capture.displayed().at_recorded_size()
+        cameras = [recording.cameras[v] for v in self.indices]
+        images = next(recording.partial_frames(0, 1)).images
+        features = [detect(images[v], recording.masks[v]) for v in self.indices]
+        tracks = join_matches(match_views(features, cameras), features)
+        if np.bincount(tracks.views, minlength=len(cameras)).min() < _MIN_TRACKS:
+            return np.zeros((len(cameras), CHANGES)), 0
+        deviations = prior_deviations(self.extent, self.config.camera_priors)
+        deviations = likely_deviations(cameras, tracks, deviations)
+        return bundle_adjust(cameras, tracks, deviations)[0], tracks.count
 
-    def scores(self, estimates: Sequence[np.ndarray], report: Callable[[int], None]) -> list[float]:
-        """Return the PSNR of the withheld pixels, dB, after fits with cameras by each of several
-        changes; `report` is called with the number of completed fits.
-        """
-        scores = []
-        for done, changes in enumerate(estimates, self.config.short_fits.rounds):
-            report(done)
-            views = _changed(self.unseen, changes)
-            scores.append(mean_psnr(self._fitted(self._begun(changes)), views, self.render))
-        return scores
+    def score(self, changes: np.ndarray) -> float:
+        """Return the PSNR of the withheld pixels, dB, after a fit with changed cameras."""
+        problem = FirstFrameProblem.of(
+            _changed(self.views, changes),
+            (_moved(self.capture.points, self.cameras, changes), self.capture.point_colors),
+            self._short,
+            self.render,
+            rng_of(self.seed, Stream.REFINED_POINTS),
+        )
+        fit = fit_first_frame(problem, self._short, rng_of(self.seed, Stream.REFINEMENT))
+        return mean_psnr(fit.gaussians, _changed(self.unseen, changes), self.render)
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
@@ -295,20 +268,11 @@ class _Problem:
         rig = self.capture.with_cameras(cameras, distortions.tolist())
         return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
 
-    def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
-        """Return the problem of a short fit with changed cameras."""
-        return FirstFrameProblem.of(
-            _changed(self.views, changes),
-            (_moved(self.capture.points, self.cameras, changes), self.capture.point_colors),
-            _short(self.config),
-            self.render,
-            rng_of(self.seed, Stream.REFINED_POINTS),
-        )
-
-    def _fitted(self, problem: FirstFrameProblem, is_later: bool = False) -> Gaussians:
-        return fit_first_frame(
-            problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)
-        ).gaussians
+    @property
+    def _short(self) -> FitConfig:
+        """Settings of a short fit."""
+        steps = self.config.short_fits.steps
+        return replace(short_fit_config(self.config), first_frame_steps=steps)
 
 
 def register_camera(
@@ -332,7 +296,7 @@ def register_camera(
     target = Target(view.image, view.mask)
     means = np.asarray(gaussians.means, np.float64)
     best = np.zeros((1, CHANGES))
-    for blur in (*_BLURS, 0.0):
+    for blur in _BLURS:
         changes = best
         error = np.inf
         for _ in range(_REGISTRATION_STEPS):
@@ -350,25 +314,6 @@ def register_camera(
             if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
                 break
     return changed_camera(view.camera, best[0])
-
-
-def _matched(
-    capture: Capture, train: Sequence[int], deviations: np.ndarray
-) -> tuple[np.ndarray, int, np.ndarray]:
-    """Return the changes [V, 11] by bundle adjustment, the number of its points, and the likely
-    deviations [11].
-
-    Without enough points, there are no changes, and the deviations equal the priors' deviations.
-    """
-    recording = capture.displayed().at_recorded_size()
-    cameras = [recording.cameras[v] for v in train]
-    images = next(recording.partial_frames(0, 1)).images
-    features = [detect(images[v], recording.masks[v]) for v in train]
-    tracks = join_matches(match_views(features, cameras), features)
-    if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
-        return np.zeros((len(train), CHANGES)), 0, deviations
-    deviations = likely_deviations(cameras, tracks, deviations)
-    return bundle_adjust(cameras, tracks, deviations)[0], tracks.count, deviations
 
 
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
@@ -410,48 +355,6 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
     is_determined = (np.sum(masks, axis=0) >= 2) & np.isfinite(intersections).all(axis=1)
     return np.where(is_determined[:, None], intersections, points).astype(np.float32)
-
-
-def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
-    """Return the settings of a short fit; a later one continues with half the steps and lower
-    rates.
-    """
-    steps = config.short_fits.steps
-    rates = config.first_frame_rates
-    if is_later:
-        steps = steps // 2
-        factors = _LATER_RATES.items()
-        rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in factors})
-    return replace(short_fit_config(config), first_frame_steps=steps, first_frame_rates=rates)
-
-
-def _joint_step(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    changes: np.ndarray,
-    deviations: np.ndarray,
-    blur: float,
-    render: RenderConfig,
-) -> tuple[Gaussians, np.ndarray]:
-    """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of
-    both.
-    """
-    means = np.asarray(gaussians.means, np.float64)
-    changed_views = _changed(views, changes)
-    shifts = [
-        _shifts(gaussians, view.camera, Target(view.image, view.mask), blur, render)
-        for view in changed_views
-    ]
-    variance = _ALIKE * np.mean([error for *_, error in shifts])
-    equations = NormalEquations(len(views), len(means))
-    for v, (view, (G, b, _)) in enumerate(zip(changed_views, shifts, strict=True)):
-        jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
-        equations.add(v, slice(None), jacobian, G / variance, b / variance)
-    of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
-    longest = _LONGEST * scene_extent([view.camera for view in views])
-    lengths = np.linalg.norm(of_means, axis=1, keepdims=True)
-    means = means + of_means * np.minimum(1, longest / np.maximum(lengths, 1e-30))
-    return replace(gaussians, means=means.astype(np.float32)), changes + of_changes
 
 
 def _shifts(
