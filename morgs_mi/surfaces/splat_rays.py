@@ -66,10 +66,11 @@ class _Tree:
         # No literals, with which every scene would compile its own kernel.
         self.depth = dr.opaque(mi.UInt32, depth)
         # For each axis, the bits of a leaf's number that choose a side along it.
-        self.flips = [dr.opaque(mi.UInt32, bits) for bits in flips]
+        self.flips = dr.opaque(mi.Vector3u, flips)
         # Lower and upper corner of every node, from 1.
         self.boxes = from_numpy(mi.Float, rows)
 
+    @dr.syntax
     def walk(
         self,
         ray: Any,
@@ -89,36 +90,27 @@ class _Tree:
             span: state -> (start, end) of the part of the ray that is searched.
         """
         inverse = dr.rcp(ray.d)
-        signs = zip(ray.d, self.flips, strict=True)
-        flip = sum((dr.select(d < 0, bits, 0) for d, bits in signs), mi.UInt32(0))
-
-        def step(node: UInt32, level: UInt32, state: Jit) -> tuple[Jit, ...]:
+        flip = dr.sum(dr.select(ray.d < 0, self.flips, 0))
+        node = dr.select(active, mi.UInt32(1), 0)
+        level = mi.UInt32(0)
+        while dr.hint(node != 0, label="tree"):
             actual = node ^ (flip >> (self.depth - level))
-            corners = (dr.gather(mi.Vector4f, self.boxes, 2 * actual + k) for k in range(2))
             # A ray in the plane of a face gives NaN, which minimum and maximum ignore.
-            sides = [(mi.Point3f(v.x, v.y, v.z) - ray.o) * inverse for v in corners]
-            low, high = span(state)
-            enter = dr.maximum(dr.max(dr.minimum(*sides)), low)
-            leave = dr.minimum(dr.min(dr.maximum(*sides)), high)
+            low = (dr.gather(mi.Vector4f, self.boxes, 2 * actual).xyz - ray.o) * inverse
+            high = (dr.gather(mi.Vector4f, self.boxes, 2 * actual + 1).xyz - ray.o) * inverse
+            start, end = span(state)
+            enter = dr.maximum(dr.max(dr.minimum(low, high)), start)
+            leave = dr.minimum(dr.min(dr.maximum(low, high)), end)
             hit = enter <= leave
             leaf = hit & (level == self.depth)
-            state = dr.if_stmt(
-                (state, actual - (mi.UInt32(1) << self.depth)),
-                leaf,
-                visit,
-                lambda state, index: state,
-                label="leaf",
-            )
+            if dr.hint(leaf, label="leaf"):
+                state = visit(state, actual - (mi.UInt32(1) << self.depth))
             down = hit & ~leaf
             up = dr.tzcnt(node + 1)
             node = dr.select(down, 2 * node, (node + 1) >> up)
+            node = dr.select(node == 1, 0, node)
             level = dr.select(down, level + 1, level - up)
-            return dr.select(node == 1, 0, node), level, state
-
-        start = dr.select(active, mi.UInt32(1), 0)
-        return dr.while_loop(
-            (start, mi.UInt32(0), state), lambda node, *_: node != 0, step, label="tree"
-        )[2]
+        return state
 
 
 def _leaf_order(centers: np.ndarray, depth: int) -> tuple[np.ndarray, list[int]]:
@@ -213,6 +205,7 @@ class SplatRays:
             ray = mi.Ray3f(dr.detach(ray))
             return self._tree.walk(ray, mi.Bool(active), (mi.Float(1),), visit, span)[0]
 
+    @dr.syntax
     def trace(self, ray: mi.Ray3f, active: Bool = True) -> tuple[Color3f, Float]:
         """Return the colour, weighted as in `rasterize`, and the transmittance of the Gaussians
         along rays [M].
@@ -226,40 +219,21 @@ class SplatRays:
         with dr.suspend_grad():
             ray = mi.Ray3f(dr.detach(ray))
             basis = dr.sh_eval(ray.d, self._degree)
-
-            def blend(
-                color: Color3f, transmittance: Float, nearest: Jit, last: Jit
-            ) -> tuple[Jit, ...]:
-                ((depth, *depths), (row, *rows), count) = nearest
-                alpha = self._response(ray, row)[1]
-                color = color + transmittance * alpha * self._color(basis, row)
-                queue = ([*depths, mi.Float(dr.inf)], [*rows, mi.UInt32(0)], count)
-                return color, transmittance * (1 - alpha), queue, (depth, row)
-
-            def advance(
-                active: Bool, color: Color3f, transmittance: Float, last: Jit
-            ) -> tuple[Jit, ...]:
-                nearest = self._nearest(ray, active, last)
-                color, transmittance, nearest, last = dr.while_loop(
-                    (color, transmittance, nearest, last),
-                    lambda color, transmittance, nearest, last: (
-                        (nearest[0][0] < dr.inf) & self._open(transmittance)
-                    ),
-                    blend,
-                    label="blend",
-                )
+            color = mi.Color3f(0)
+            transmittance = mi.Float(1)
+            last = (mi.Float(-dr.inf), mi.UInt32(0))
+            active = mi.Bool(active)
+            while dr.hint(active, label="trace"):
+                depths, rows, count = self._nearest(ray, active, last)
+                while dr.hint((depths[0] < dr.inf) & self._open(transmittance), label="blend"):
+                    last = (depths[0], rows[0])
+                    alpha = self._response(ray, rows[0])[1]
+                    color += transmittance * alpha * self._color(basis, rows[0])
+                    transmittance *= 1 - alpha
+                    depths = [*depths[1:], mi.Float(dr.inf)]
+                    rows = [*rows[1:], mi.UInt32(0)]
                 # Where fewer were found than can be sorted, none is left.
-                return (
-                    active & self._open(transmittance) & (nearest[2] >= _SORTED),
-                    color,
-                    transmittance,
-                    last,
-                )
-
-            state = (mi.Bool(active), mi.Color3f(0), mi.Float(1), (mi.Float(-dr.inf), mi.UInt32(0)))
-            _, color, transmittance, _ = dr.while_loop(
-                state, lambda active, *_: active, advance, label="trace"
-            )
+                active &= self._open(transmittance) & (count >= _SORTED)
             return color, transmittance
 
     def _open(self, transmittance: Float) -> Bool:
@@ -302,9 +276,9 @@ class SplatRays:
         segment.
         """
         x, y, z, more = (dr.gather(mi.Vector4f, self._rows, 4 * row + k) for k in range(4))
-        offset = ray.o - mi.Point3f(x.w, y.w, z.w)
-        W = [mi.Vector3f(v.x, v.y, v.z) for v in (x, y, z)]
-        o, d = (mi.Vector3f(*(dr.dot(w, v) for w in W)) for v in (mi.Vector3f(offset), ray.d))
+        W = mi.Matrix3f(x.xyz, y.xyz, z.xyz)
+        o = W @ mi.Vector3f(ray.o - mi.Point3f(x.w, y.w, z.w))
+        d = W @ ray.d
         dd = dr.squared_norm(d)
         depth = -dr.dot(o, d) / dd
         r_sigma = dr.sqrt(dd)
@@ -323,8 +297,7 @@ class SplatRays:
         K = len(basis)
         total = mi.Color3f(0.5)
         for k, value in enumerate(basis):
-            c = dr.gather(mi.Vector4f, self._coeffs, K * row + k)
-            total += value * mi.Color3f(c.x, c.y, c.z)
+            total += value * mi.Color3f(dr.gather(mi.Vector4f, self._coeffs, K * row + k).xyz)
         return dr.maximum(total, 0)
 
 

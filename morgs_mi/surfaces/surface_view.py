@@ -317,6 +317,7 @@ class SurfaceView:
         return bool(attached)
 
 
+@dr.syntax
 def coverage_and_depth(
     scene: Any, sensor: mi.Sensor, camera: Camera, crop: Crop
 ) -> tuple[Float, Float]:
@@ -332,7 +333,7 @@ def coverage_and_depth(
     coverage = dr.zeros(mi.Float, crop.count)
     depth = dr.full(mi.Float, dr.inf, crop.count)
     box = _rectangle(scene.bbox(), camera, crop)
-    if not box.count:
+    if dr.hint(not box.count, mode="scalar"):
         return coverage, depth
     lane: UInt32 = dr.arange(mi.UInt32, box.count)
     columns: UInt32 = dr.opaque(mi.UInt32, box.size.x)
@@ -343,15 +344,17 @@ def coverage_and_depth(
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
-    def step(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+    k = mi.UInt32(0)
+    count = mi.Float(0)
+    total = mi.Float(0)
+    while dr.hint(k < _GRID**2, label="coverage"):
         rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
         intersection = scene.ray_intersect_preliminary(rays, coherent=True)
         hit = intersection.is_valid()
         z = (to_camera @ rays(dr.select(hit, intersection.t, 0))).z
-        return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
-
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, step, label="coverage")
+        count += dr.select(hit, mi.Float(1), 0)
+        total += dr.select(hit, z, 0)
+        k += 1
     dr.scatter(coverage, count / _GRID**2, pixel, mode=dr.ReduceMode.Permute)
     dr.scatter(
         depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute

@@ -39,7 +39,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
-from morgs_mi.core.types import Arrays, Float, SceneDict, UInt32, Vector3f
+from morgs_mi.core.types import Arrays, Float, SceneDict, Vector3f
 from morgs_mi.extras.light.light_probe import CLIPPED, check_point, light_probe
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.io.scene_file import build_of, failures_in
@@ -432,6 +432,7 @@ def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:
     return csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
 
 
+@dr.syntax
 def _irradiance(
     emitter: mi.Emitter, receivers: _Receivers, blockers: Any, samples: int
 ) -> tuple[Float, Float]:
@@ -443,16 +444,17 @@ def _irradiance(
     step_size = dr.opaque(mi.Float, 1 / samples)
     no_scramble: Any = 0
 
-    def step(k: UInt32, blocked: Float, total: Float) -> tuple[UInt32, Float, Float]:
+    k = mi.UInt32(0)
+    blocked = mi.Float(0)
+    total = mi.Float(0)
+    while dr.hint(k < count, label="shadow"):
         sample = mi.Point2f((mi.Float(k) + 0.5) * step_size, mi.radical_inverse_2(k, no_scramble))
         ds, weight = emitter.sample_direction(it, sample)
         irradiance = dr.mean(mi.unpolarized_spectrum(weight)) * receivers.response(ds.d)
         ray = mi.Ray3f(receivers.centers, ds.d)
-        if not far:
+        if dr.hint(not far, mode="scalar"):
             ray.maxt = ds.dist * (1 - 1e-4)
-        is_hidden = blockers.ray_test(ray, irradiance > 0)
-        return k + 1, blocked + dr.select(is_hidden, irradiance, 0), total + irradiance
-
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-    _, blocked, total = dr.while_loop(state, lambda k, *_: k < count, step, label="shadow")
+        blocked += dr.select(blockers.ray_test(ray, irradiance > 0), irradiance, 0)
+        total += irradiance
+        k += 1
     return blocked, total

@@ -19,7 +19,6 @@ Mitsuba has a base class for every variant, so this module is imported again aft
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import reload
 from typing import Annotated, Any
 
@@ -28,7 +27,7 @@ import mitsuba as mi
 from annotated_types import Ge
 from mitsuba.ad.integrators import common  # pyright: ignore
 
-from morgs_mi.core.types import Bool, Color3f, Float, UInt32
+from morgs_mi.core.types import Bool, Color3f, Float
 from morgs_mi.extras.light.light_probe import CLIPPED, radiance
 from morgs_mi.platform.checks import require
 from morgs_mi.platform.config import Count, check_value
@@ -42,21 +41,6 @@ _PROPERTIES = {
     "rr_depth": Count,
     "clipped": Annotated[float, Ge(1)],
 }
-
-
-@dataclass
-class _Path:
-    """Paths after some segments, the state of the loop."""
-
-    ray: mi.Ray3f  # next segment
-    depth: UInt32  # number of segments that ended on a surface
-    L: Color3f  # radiance so far; in the second pass, what is left of it
-    δL: Color3f  # its derivative
-    β: Color3f  # throughput
-    η: Float  # ratio of the indices of refraction
-    si: mi.SurfaceInteraction3f  # surface that the next segment leaves
-    pdf: Float  # density of its direction there
-    is_delta: Bool  # whether the direction had no choice
 
 
 class SplatPathIntegrator(common.RBIntegrator):
@@ -94,6 +78,7 @@ class SplatPathIntegrator(common.RBIntegrator):
         self.splats: SplatRays | None = None
         self.srgb = True
 
+    @dr.syntax
     def sample(
         self,
         mode: dr.ADMode,
@@ -117,12 +102,20 @@ class SplatPathIntegrator(common.RBIntegrator):
         ctx = mi.BSDFContext()
         sign = 1 if primal else -1
 
-        def bounce(active: Bool, sampler: mi.Sampler, path: _Path) -> tuple[Bool, Any, _Path]:
-            ray = path.ray
-            depth = path.depth
-            L = path.L
-            δL = path.δL
-            β = path.β
+        ray = mi.Ray3f(dr.detach(ray))
+        depth = mi.UInt32(0)  # number of segments that ended on a surface
+        L = mi.Spectrum(0 if primal else state_in)  # radiance; in the second pass, what is left
+        δL = mi.Spectrum(0 if δL is None else δL)  # its derivative
+        β = mi.Spectrum(1)  # throughput
+        η = mi.Float(1)  # ratio of the indices of refraction
+        active = mi.Bool(active)
+        # The surface that the segment leaves, the density of its direction there, and whether the
+        # direction had no choice.
+        last_si = dr.zeros(mi.SurfaceInteraction3f)
+        last_pdf = mi.Float(1)
+        last_is_delta = mi.Bool(True)
+
+        while dr.hint(active, label=f"splat_path ({mode.name})"):
             si = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
             bsdf = si.bsdf(ray)
 
@@ -136,9 +129,9 @@ class SplatPathIntegrator(common.RBIntegrator):
             # ------------------------- Direct emission --------------------------
 
             visible = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
-            ds = mi.DirectionSample3f(scene, si, path.si)
+            ds = mi.DirectionSample3f(scene, si, last_si)
             mis = common.mis_weight(
-                path.pdf, scene.pdf_emitter_direction(path.si, ds, ~path.is_delta)
+                last_pdf, scene.pdf_emitter_direction(last_si, ds, ~last_is_delta)
             )
             with dr.resume_grad(when=not primal):
                 Le = β * mis * ds.emitter.eval(si, visible)
@@ -156,7 +149,7 @@ class SplatPathIntegrator(common.RBIntegrator):
             )
             wo = si.to_local(ds.d)
             with dr.resume_grad(when=not primal):
-                if not primal:
+                if dr.hint(not primal, mode="scalar"):
                     attached = scene.eval_emitter_direction(si, ds, with_light)
                     weight = weight * dr.relative_grad(attached)
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, with_light)
@@ -169,18 +162,18 @@ class SplatPathIntegrator(common.RBIntegrator):
             )
             L += sign * dr.detach(Le + Ld)
             with dr.resume_grad(when=not primal):
-                if not primal:
+                if dr.hint(not primal, mode="scalar"):
                     onward = L * dr.relative_grad(bsdf.eval(ctx, si, direction_sample.wo, proceed))
                     Lo = Le + Ld + onward
                     # Not attached where positions alone are differentiated.
-                    if dr.grad_enabled(Lo):
-                        if mode == dr.ADMode.Backward:
+                    if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
+                        if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                             dr.backward_from(δL * Lo)
                         else:
-                            δL = δL + dr.forward_to(Lo)
-            β = β * scale
-            η = path.η * direction_sample.eta
-            onwards = si.spawn_ray(si.to_world(direction_sample.wo))
+                            δL += dr.forward_to(Lo)
+            β *= scale
+            η *= direction_sample.eta
+            ray = si.spawn_ray(si.to_world(direction_sample.wo))
 
             # ------------------------ Stopping criterion ------------------------
 
@@ -189,26 +182,12 @@ class SplatPathIntegrator(common.RBIntegrator):
             roulette = depth >= self.rr_depth
             proceed &= (largest > 0) & (~roulette | (sampler.next_1d(proceed) < survival))
             β = dr.select(roulette, β * dr.rcp(survival), β)
-            is_delta: Bool = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
+            last_is_delta = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
+            last_pdf = direction_sample.pdf
+            last_si = dr.detach(si)
             depth = dr.select(si.is_valid(), depth + 1, depth)
-            end = _Path(onwards, depth, L, δL, β, η, dr.detach(si), direction_sample.pdf, is_delta)
-            return proceed, sampler, end
-
-        start = _Path(
-            mi.Ray3f(dr.detach(ray)),
-            mi.UInt32(0),
-            mi.Spectrum(0 if primal else state_in),
-            mi.Spectrum(0 if δL is None else δL),
-            mi.Spectrum(1),
-            mi.Float(1),
-            dr.zeros(mi.SurfaceInteraction3f),
-            mi.Float(1),
-            mi.Bool(True),
-        )
-        state = (mi.Bool(active), sampler, start)
-        label = f"splat_path ({mode.name})"
-        end = dr.while_loop(state, lambda active, *_: active, bounce, label=label)[2]
-        return end.L if primal else end.δL, end.depth != 0, [], end.L
+            active = proceed
+        return L if primal else δL, depth != 0, [], L
 
     def _layer(self, ray: mi.Ray3f, active: Bool) -> tuple[Any, Float]:
         """Return the radiance that the Gaussians on a segment emit, and their transmittance."""
