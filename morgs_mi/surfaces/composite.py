@@ -55,7 +55,8 @@ def composite(
         view: the surfaces on P pixels of a camera's image.
         config: settings of the rasteriser.
     """
-    encode, decode = (encode_traced, decode_traced) if view.srgb else (lambda v: v,) * 2
+    encode = encode_traced if view.srgb else mi.Color3f
+    decode = decode_traced if view.srgb else mi.Color3f
     channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
     image = rasterize(gaussians, view.pixels.camera, channels, config=config)
     crop = view.pixels.crop
@@ -63,23 +64,20 @@ def composite(
     front = _in_front(gaussians, channels, view, config) or whole
     f = view.coverage
     has_surface = view.coverage > 0
-    t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
+    t_front = 1 - front["alpha"][0]
+    t_whole = 1 - whole["alpha"][0]
 
     has_environment = view.behind is not None
-    behind = view.behind if has_environment else mi.Color3f(0)
-    ground = [0.0] * 3 if background is None or has_environment else background
-    color = []
-    for k in range(3):
-        L = view.image[:, :, k].array
-        E = behind[k]
-        # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it
-        # is.
-        surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(has_surface, f, 1)
-        rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
-        beyond = encode(rest) + ground[k]
-        inner_color = decode(dr.fma(t_front, encode(surface), front["color"][k]))
-        outer_color = decode(dr.fma(t_whole, beyond, whole["color"][k]))
-        color.append(dr.fma(f, inner_color - outer_color, outer_color))
+    E = view.behind if has_environment else mi.Color3f(0)
+    ground = mi.Color3f(0 if background is None or has_environment else background)
+    L = mi.Color3f([view.image[:, :, k].array for k in range(3)])
+    # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
+    # Quotients of vectors: that of a vector and a number is a product with its rounded inverse.
+    surface = dr.maximum(L - (1 - f) * E, 0) / mi.Color3f(dr.select(has_surface, f, 1))
+    rest = dr.maximum(L - f * surface, 0) / mi.Color3f(dr.select(f < 1, 1 - f, 1))
+    inner_color = decode(dr.fma(t_front, encode(surface), mi.Color3f(front["color"])))
+    outer_color = decode(dr.fma(t_whole, encode(rest) + ground, mi.Color3f(whole["color"])))
+    color = dr.fma(f, inner_color - outer_color, outer_color)
 
     splats = {
         name: [dr.lerp(b, a, f) for a, b in zip(front[name], whole[name], strict=True)]
@@ -95,7 +93,7 @@ def composite(
     if "motion" in channels:
         splats["motion"] = _ratio(splats["motion"], alpha)
     opaque = mi.Float(1) if has_environment else dr.fma(f, t_whole, 1 - t_whole)
-    return {**splats, "color": color, "alpha": [opaque]}
+    return {**splats, "color": [*color], "alpha": [opaque]}
 
 
 def _in_front(

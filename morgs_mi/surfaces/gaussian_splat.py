@@ -6,7 +6,6 @@ Mitsuba has a base class for every variant, so this module is imported again aft
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.types import Float, Tensor, UInt32
-from morgs_mi.platform.checks import bounded, errors_at
+from morgs_mi.platform.checks import bounded, errors_at, require
 from morgs_mi.platform.config import check_value
 from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
@@ -31,6 +30,7 @@ from morgs_mi.surfaces.composite import Columns, composite, cropped
 from morgs_mi.surfaces.surface_view import Crop, SampledPixels, SurfaceView, ellipsoids_of
 
 _log = logging.getLogger(__name__)
+_PLACE = "gaussian_splat"  # where its errors begin
 
 # Settings of the rasteriser that are properties of the plugin.
 _SETTINGS = (
@@ -69,67 +69,91 @@ def _scene_gaussians(scene: mi.Scene, attributes: list[str]) -> _SceneGaussians:
         if present < K:
             zeros = dr.zeros(mi.TensorXf, (N, K - present, 3))
             part["sh_coeffs"] = dr.concat([part["sh_coeffs"], zeros], axis=1)
-    if len(parts) > 1:
-        parts = [{name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}]
-    return _SceneGaussians(**parts[0])
+    return _SceneGaussians(
+        **{name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}
+    )
 
 
-def _property_problems(background: Any, aovs: list[str], surfaces: object) -> Iterator[str]:
-    """Yield a sentence for each property of the plugin that is refused."""
-    values = np.ravel(background)
-    is_image = np.ndim(background) > 1
-    if background is not None and (
-        not (values.size in (1, 3) or is_image)
-        or values.dtype.kind not in "fiu"
-        or not bounded(values)
-    ):
-        yield (
-            "`background` must be one or three finite numbers, or an image of them, got a "
-            f"{type(background).__name__}, {str(background)[:20]!r}; pass a colour such as "
-            "{'type': 'rgb', 'value': 1} or a mi.TensorXf [H, W, 3]"
-        )
-    if is_image and surfaces is not None:
-        yield (
-            "`background` must be a colour with `surfaces`, got an image; give the scene an "
-            "`envmap` emitter"
-        )
-    if surfaces is not None and (
-        not isinstance(surfaces, mi.Integrator) or isinstance(surfaces, GaussianSplatIntegrator)
-    ):
-        yield (
-            "`surfaces` must be an integrator of surfaces such as {'type': 'path'}, got "
-            f"{surfaces!r}; pass another one"
-        )
-    if surfaces is not None and not mi.is_rgb:
-        yield (
-            f"with `surfaces`, expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; "
-            "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours"
-        )
-    names = aov_attributes()
-    for name in aovs:
-        if name not in names:
-            yield f"`aovs` must be out of {', '.join(names)}, got {name!r}; separate them by commas"
+def _background(value: Any) -> Any:
+    """Return the plugin's background: a colour, an image as it is, or None.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if value is None:
+        return None
+    values = np.ravel(value)
+    is_color = values.size in (1, 3)
+    require(
+        (is_color or np.ndim(value) > 1) and values.dtype.kind in "fiu" and bounded(values),
+        _PLACE,
+        "`background` must be one or three finite numbers, or an image of them",
+        f"a {type(value).__name__}, {str(value)[:20]!r}",
+        "pass a colour such as {'type': 'rgb', 'value': 1} or a mi.TensorXf [H, W, 3]",
+    )
+    return mi.Color3f(np.broadcast_to(values.astype(float), 3)) if is_color else value
 
 
-def _scene_problems(
+def _check_surfaces(surfaces: Any, background: Any) -> None:
+    """Raise an error unless an integrator can render the surfaces."""
+    require(
+        isinstance(surfaces, mi.Integrator) and not isinstance(surfaces, GaussianSplatIntegrator),
+        _PLACE,
+        "`surfaces` must be an integrator of surfaces such as {'type': 'path'}",
+        repr(surfaces),
+        "pass another one",
+    )
+    require(
+        background is None or isinstance(background, mi.Color3f),
+        _PLACE,
+        "`background` must be a colour with `surfaces`",
+        "an image",
+        "give the scene an `envmap` emitter",
+    )
+    require(
+        mi.is_rgb,
+        _PLACE,
+        "with `surfaces`, expected a variant such as 'llvm_ad_rgb'",
+        repr(mi.variant()),
+        "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours",
+    )
+
+
+def _check_scene(
     scene: mi.Scene, film: mi.Film, num_views: int, border: int, with_surfaces: bool
-) -> Iterator[str]:
-    """Yield a sentence for each part of a scene that cannot be rendered."""
-    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        name = film.class_name()
-        yield f"expected an `hdrfilm`, got {name}; replace it, because only RGB is drawn"
-    if num_views > 1 and (border or with_surfaces):
-        reason = "`sample_border` in its film" if border else "`surfaces`"
-        yield f"expected a `batch` sensor without {reason}; render its sensors one by one"
+) -> None:
+    """Raise an error unless a scene can be rendered."""
+    require(
+        not mi.has_flag(film.flags(), mi.FilmFlags.Special),
+        _PLACE,
+        "expected an `hdrfilm`",
+        film.class_name(),
+        "replace it, because only RGB is drawn",
+    )
+    for name, is_set in (("sample_border` in its film", border), ("surfaces`", with_surfaces)):
+        require(
+            num_views == 1 or not is_set,
+            _PLACE,
+            f"expected a `batch` sensor without `{name}",
+            "both",
+            "render its sensors one by one",
+        )
     for shape in scene.shapes():
-        if not (with_surfaces or shape.is_ellipsoids()):
-            yield (
-                f"expected `ellipsoids` shapes only, got {shape.class_name()} {shape.id()!r}; "
-                "remove it from the scene, or set `surfaces` to an integrator that renders it, "
-                "such as `path`"
-            )
-    if not ellipsoids_of(scene):
-        yield "expected a scene with an `ellipsoids` shape, got none; add one"
+        require(
+            with_surfaces or shape.is_ellipsoids(),
+            _PLACE,
+            "expected `ellipsoids` shapes only",
+            f"{shape.class_name()} {shape.id()!r}",
+            "remove it from the scene, or set `surfaces` to an integrator that renders it, such as "
+            "`path`",
+        )
+    require(
+        ellipsoids_of(scene),
+        _PLACE,
+        "expected a scene with an `ellipsoids` shape",
+        "none",
+        "add one",
+    )
 
 
 def _shape_gaussians(shape: mi.Shape, attributes: list[str]) -> dict[str, Tensor]:
@@ -166,11 +190,12 @@ class _ForwardPass(NamedTuple):
         """Return whether the inputs are the same numbers and the same Dr.Jit variables as those of
         the image.
         """
-        numbers, own_numbers = (
-            [(leaf.index, leaf.index_ad) if dr.is_jit_v(leaf) else leaf for leaf in leaves]
-            for leaves in (inputs, self.inputs)
-        )
-        return numbers == own_numbers
+        return list(map(_identity, inputs)) == list(map(_identity, self.inputs))
+
+
+def _identity(leaf: Any) -> Any:
+    """Return the indices of a Dr.Jit variable, or a number as it is."""
+    return (leaf.index, leaf.index_ad) if dr.is_jit_v(leaf) else leaf
 
 
 def _leaves(value: Any) -> list[Any]:
@@ -289,19 +314,20 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         super().__init__(props)
         for name, kind in (("srgb_primitives", bool), ("aovs", str)):
             if name in props:
-                check_value("gaussian_splat", name, props[name], kind)
+                check_value(_PLACE, name, props[name], kind)
         self.srgb_primitives = props.get("srgb_primitives", True)
-        with errors_at("gaussian_splat"):
+        with errors_at(_PLACE):
             self.config = RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
+        for name in self.aovs:
+            names = aov_attributes()
+            expected = f"`aovs` must be out of {', '.join(names)}"
+            require(name in names, _PLACE, expected, repr(name), "separate them by commas")
+        self.background = _background(props.get("background", None))
         self.surfaces = props.get("surfaces", None)
-        background = props.get("background", None)
-        for problem in _property_problems(background, self.aovs, self.surfaces):
-            raise ValueError(f"gaussian_splat: {problem}.")
-        self.background = background
-        if np.size(background) in (1, 3) and background is not None:
-            self.background = mi.Color3f(np.broadcast_to(np.ravel(background).astype(float), 3))
+        if self.surfaces is not None:
+            _check_surfaces(self.surfaces, self.background)
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
 
@@ -335,7 +361,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         evaluate: bool = True,
     ) -> Tensor:
         # Before any memory is released, which would end the process.
-        refuse_freezing("gaussian_splat")
+        refuse_freezing(_PLACE)
         self.forward_pass = None
         with dr.resume_grad():
             inputs = self._inputs(scene, sensor)
@@ -410,14 +436,14 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
-        for problem in _scene_problems(scene, film, len(views), border, self.surfaces is not None):
-            raise ValueError(f"gaussian_splat: {problem}.")
+        _check_scene(scene, film, len(views), border, self.surfaces is not None)
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         required = (aov_attributes()[name] for name in self.aovs)
         attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
         gaussians = _scene_gaussians(scene, attributes)
-        channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
+        colors = ("color", "alpha") if has_alpha else ("color",)
+        channels = (*colors, *self.aovs)
         # Cropped after rendering: the projection's linearisation depends on the extent of the whole
         # view.
         crop = Crop(film.crop_offset(), film.crop_size() + 2 * border)
@@ -433,12 +459,9 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             columns = self._splats(gaussians, cameras, channels, crop)
         else:
             columns = composite(gaussians, channels, self.background, surfaces, self.config)
-        values = [
-            *columns["color"],
-            *(columns["alpha"] if has_alpha else []),
-            mi.Float(1),  # the sample's weight
-            *(value for name in self.aovs for value in columns[name]),
-        ]
+        columns["weight"] = [mi.Float(1)]  # of the sample
+        names = (*colors, "weight", *self.aovs)
+        values = [value for name in names for value in columns[name]]
 
         film.prepare(self.aov_names())
         block = film.create_block()
@@ -474,24 +497,24 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def _warn(self, scene: mi.Scene, gaussians: _SceneGaussians) -> None:
         """Log what the image leaves out, once."""
-        sentences = []
         if scene.emitters() and self.surfaces is None:
-            sentences.append(
+            self._warn_once(
                 "gaussian_splat ignores the scene's emitters; set its `background` colour instead."
             )
         opacities = dr.detach(gaussians.opacities.array)
         outside: UInt32 = dr.count((opacities < 0) | (opacities > 1))
         if count := int(outside[0]):
-            sentences.append(
-                f"gaussian_splat: `opacities` must be in [0, 1], got {count} values outside: "
-                "those below 0 are not drawn and get no gradient, those above 1 are cut off at "
-                "full coverage; clamp them after each step."
+            self._warn_once(
+                "gaussian_splat: `opacities` must be in [0, 1], got %d values outside: those below "
+                "0 are not drawn and get no gradient, those above 1 are cut off at full coverage; "
+                "clamp them after each step.",
+                count,
             )
-        for sentence in sentences:
-            key = sentence.partition(",")[0]
-            if key not in self.warnings:
-                _log.warning(sentence)
-                self.warnings.add(key)
+
+    def _warn_once(self, sentence: str, *values: int) -> None:
+        if sentence not in self.warnings:
+            _log.warning(sentence, *values)
+            self.warnings.add(sentence)
 
     def to_string(self) -> str:
         names = ("aovs", "background", "config", "srgb_primitives", "surfaces")

@@ -96,8 +96,8 @@ class _Tree:
         while dr.hint(node != 0, label="tree"):
             actual = node ^ (flip >> (self.depth - level))
             # A ray in the plane of a face gives NaN, which minimum and maximum ignore.
-            low = (dr.gather(mi.Vector4f, self.boxes, 2 * actual).xyz - ray.o) * inverse
-            high = (dr.gather(mi.Vector4f, self.boxes, 2 * actual + 1).xyz - ray.o) * inverse
+            low = (_packet(self.boxes, 2 * actual).xyz - ray.o) * inverse
+            high = (_packet(self.boxes, 2 * actual + 1).xyz - ray.o) * inverse
             start, end = span(state)
             enter = dr.maximum(dr.max(dr.minimum(low, high)), start)
             leave = dr.minimum(dr.min(dr.maximum(low, high)), end)
@@ -275,7 +275,7 @@ class SplatRays:
         """Return the depth of a Gaussian's largest response along rays, and its alpha on the
         segment.
         """
-        x, y, z, more = (dr.gather(mi.Vector4f, self._rows, 4 * row + k) for k in range(4))
+        x, y, z, more = (_packet(self._rows, 4 * row + k) for k in range(4))
         W = mi.Matrix3f(x.xyz, y.xyz, z.xyz)
         o = W @ mi.Vector3f(ray.o - mi.Point3f(x.w, y.w, z.w))
         d = W @ ray.d
@@ -297,8 +297,13 @@ class SplatRays:
         K = len(basis)
         total = mi.Color3f(0.5)
         for k, value in enumerate(basis):
-            total += value * mi.Color3f(dr.gather(mi.Vector4f, self._coeffs, K * row + k).xyz)
+            total += value * mi.Color3f(_packet(self._coeffs, K * row + k).xyz)
         return dr.maximum(total, 0)
+
+
+def _packet(values: Float, index: UInt32) -> Any:
+    """Return the four floats of a row, a `mi.Vector4f`."""
+    return dr.gather(mi.Vector4f, values, index)
 
 
 def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:

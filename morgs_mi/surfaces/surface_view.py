@@ -21,6 +21,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Color3f, Float, Tensor, UInt32, Vector2f
+from morgs_mi.platform.checks import require
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.splat_rays import SplatRays
 
@@ -93,25 +94,30 @@ def surface_scene(scene: mi.Scene) -> mi.Scene | None:
     surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not surfaces and scene.environment() is None:
         return None
-    problem = ""
-    if not scene.emitters():
-        problem = (
-            "expected an emitter that lights the surfaces, got none; add one to the scene, such as "
-            "an `envmap` of morgs_mi.light_probe()"
-        )
+    place = "gaussian_splat"
+    require(
+        scene.emitters(),
+        place,
+        "expected an emitter that lights the surfaces",
+        "none",
+        "add one to the scene, such as an `envmap` of morgs_mi.light_probe()",
+    )
     for shape in surfaces:
         name = f"{shape.class_name()} {shape.id()!r}"
-        if shape.is_medium_transition():
-            problem = problem or (
-                f"expected surfaces, got {name}, the boundary of a medium; remove the medium, "
-                "because splats have no place in the order of a volume's light"
-            )
-        elif shape.bsdf() is None:
-            problem = problem or (
-                f"the {name} must have a BSDF, got none; set `bsdf` where the shape is defined"
-            )
-    if problem:
-        raise ValueError(f"gaussian_splat: {problem}.")
+        require(
+            not shape.is_medium_transition(),
+            place,
+            "expected surfaces",
+            f"{name}, the boundary of a medium",
+            "remove the medium, because splats have no place in the order of a volume's light",
+        )
+        require(
+            shape.bsdf() is not None,
+            place,
+            f"the {name} must have a BSDF",
+            "none",
+            "set `bsdf` where the shape is defined",
+        )
     return shared_scene([*surfaces, *lights(scene)], scene)
 
 

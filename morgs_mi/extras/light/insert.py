@@ -39,7 +39,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
-from morgs_mi.core.types import Arrays, Float, SceneDict, Vector3f
+from morgs_mi.core.types import Arrays, Float, SceneDict, UInt32, Vector3f
 from morgs_mi.extras.light.light_probe import CLIPPED, check_point, light_probe
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.io.scene_file import build_of, failures_in
@@ -444,7 +444,7 @@ def _irradiance(
     step_size = dr.opaque(mi.Float, 1 / samples)
     no_scramble: Any = 0
 
-    k = mi.UInt32(0)
+    k: UInt32 = mi.UInt32(0)
     blocked = mi.Float(0)
     total = mi.Float(0)
     while dr.hint(k < count, label="shadow"):
