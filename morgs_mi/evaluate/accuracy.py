@@ -39,8 +39,10 @@ from morgs_mi.render.render_config import RenderConfig
 
 ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs")
 """Attributes on which the colour depends."""
+# What has an error: the image, and the gradient of each attribute.
+_COMPARED: tuple[str, ...] = ("image", *ATTRIBUTES)
 # Those whose gradients may almost vanish: their errors are relative to the largest of the three.
-_SHAPE = ("log_scales", "quats", "logit_opacities")
+_SHAPE = np.isin(_COMPARED, ("log_scales", "quats", "logit_opacities"))
 # Pairs of pixel and Gaussian that are evaluated together: 16 MB per array.
 PAIRS = 2_000_000
 # Random pixels of a camera that are compared, of which a half chooses. For 100,000 Gaussians the
@@ -313,17 +315,16 @@ class _Sample:
         weights32 = mi.TensorXf(weights.astype(np.float32))
         return cls(camera, mask, weights32, {"image": colors, **gradients})
 
-    def errors(self, image: np.ndarray, gradients: Arrays) -> dict[str, float]:
-        """Return the relative errors of a rendered image and of its gradients."""
+    def errors(self, image: np.ndarray, gradients: Arrays) -> np.ndarray:
+        """Return the relative errors of a rendered image and of its gradients, in the order of
+        `_COMPARED`.
+        """
         results = {"image": image[self.mask], **gradients}
-        norms = {name: np.linalg.norm(values) + 1e-30 for name, values in self.expected.items()}
-        least = 0.01 * max(norms[name] for name in _SHAPE)
-        for name in _SHAPE:
-            norms[name] = max(norms[name], least)
-        return {
-            name: float(np.linalg.norm(results[name] - expected) / norms[name])
-            for name, expected in self.expected.items()
-        }
+        expected = self.expected
+        differences = [np.linalg.norm(results[name] - expected[name]) for name in _COMPARED]
+        norms = np.array([np.linalg.norm(expected[name]) for name in _COMPARED]) + 1e-30
+        least = np.where(_SHAPE, 0.01 * norms[_SHAPE].max(), 0)
+        return np.array(differences) / np.maximum(norms, least)
 
 
 def accuracy(
@@ -394,13 +395,12 @@ def accuracy(
     configs = {name: replace(config, **change) for name, change in CHANGES.items()}
     samples = [*choosing, *checking]
     seconds = {name: np.zeros((1 + ROUNDS, len(samples))) for name in configs}
-    errors: dict[str, list[dict[str, float]]] = {}
+    errors = {name: np.zeros((len(samples), len(_COMPARED))) for name in configs}
     stage = Progress(progress, "Measuring settings")
     # In turns, because other programs may slow down some of them; the first round compiles.
     steps = list(product(range(1 + ROUNDS), configs.items()))
     for done, (k, (name, setting)) in enumerate(steps):
         stage(done, len(steps))
-        errors[name] = []
         for i, sample in enumerate(samples):
             dr.sync_thread()
             start = time.perf_counter()
@@ -412,14 +412,14 @@ def accuracy(
             seconds[name][k, i] = time.perf_counter() - start
             dr.clear_grad(tensors)
             arrays = {key: np.array(gradient) for key, gradient in gradients.items()}
-            errors[name].append(sample.errors(np.array(image), arrays))
+            errors[name][i] = sample.errors(np.array(image), arrays)
     rows = []
     for name, setting in configs.items():
-        choosing_errors = errors[name][: len(views)]
-        largest = {key: max(e[key] for e in choosing_errors) for key in choosing_errors[0]}
-        checked = max(max(e.values()) for e in errors[name][len(views) :])
+        largest = errors[name][: len(views)].max(axis=0).tolist()
+        checked = float(errors[name][len(views) :].max())
         time_of_image = float(np.median(seconds[name][1:], axis=0).mean())
-        rows.append(Setting(name, setting, time_of_image, largest, checked))
+        by_name = dict(zip(_COMPARED, largest, strict=True))
+        rows.append(Setting(name, setting, time_of_image, by_name, checked))
     choice = chosen(rows, tolerance)
     return Accuracy(tuple(rows), tolerance, len(views), choice and choice.config, config)
 
