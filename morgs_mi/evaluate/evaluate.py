@@ -1,24 +1,26 @@
-"""Evaluate a stream: compare its decoded frames with the recording and with the ground truth, by a
-list of measures.
-"""
+"""Evaluate a stream: compare its decoded frames with the recording and with the ground truth."""
 
 from __future__ import annotations
 
-from collections import ChainMap
-from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.evaluate.comparison import ComparedClip
 from morgs_mi.evaluate.lpips import Lpips
-from morgs_mi.evaluate.measures import (
-    Motion3D,
-    Quality,
-    Variation,
+from morgs_mi.evaluate.measures import Motion3D, view_scores
+from morgs_mi.evaluate.metrics import StillVariation, slope
+from morgs_mi.evaluate.results import (
+    Evaluation,
+    FrameScores,
+    PlaybackTimes,
+    Sizes,
+    VariationScores,
+    ViewScores,
+    known_mean,
 )
-from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.platform.checks import require
 from morgs_mi.platform.files import REPORT
@@ -28,7 +30,17 @@ from morgs_mi.playback.player import playback_speed
 from morgs_mi.playback.stream_header import between_cameras
 from morgs_mi.playback.streams import PlayableStream, open_stream
 
-_UNKNOWN = (None, 0, ())  # Of a frame without a report.
+# Compression flickers: after a hundred frames half the pixels of a real recording have changed
+# once.
+_FALSE_ALARMS = 0.02
+
+
+class _FitReport(NamedTuple):
+    """What the report of a fit has on a frame."""
+
+    seconds: float | None = None  # wall time
+    num_missing: int = 0  # views without an image
+    fingerprints: tuple[str, ...] = ()  # of the images, empty where missing
 
 
 @interrupts_raised()
@@ -70,15 +82,20 @@ def evaluate_stream(
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
     fitted = _fitted(stream.path)
-    measures = [Quality(lpips), Variation(clip), Motion3D(clip)]
-    rows = []
+    false_alarms = _FALSE_ALARMS if recording.truth is None else 0
+    variations = {view: StillVariation(recording.masks[view], false_alarms) for view in clip.views}
+    motion = Motion3D(clip)
+    rows: list[FrameScores] = []
+    without_images = []
     for frame in clip.frames():
+        # Unknown without an image.
+        views = {clip.cameras[view].name: ViewScores() for view in clip.views}
         for view in frame.views():
-            for measure in measures:
-                measure.add_view(view)
+            views[view.camera.name] = view_scores(view, lpips)
+            variations[view.index].add(view.rendered, view.recorded, view.moving)
         index = frame.state.frame
-        seconds, _, fingerprints = fitted.get(index, _UNKNOWN)
-        pairs = zip(fingerprints, image_fingerprints(frame.recorded), strict=False)
+        report = fitted.get(index, _FitReport())
+        pairs = zip(report.fingerprints, image_fingerprints(frame.recorded), strict=False)
         # An image may have been missing in the fit, or may be missing now.
         if not any_recording and any(a != b for a, b in pairs if a and b):
             raise ValueError(
@@ -86,16 +103,16 @@ def evaluate_stream(
                 f"other images in frame {index}; pass that capture (--capture), or compare with "
                 "any recording (--any-recording)."
             )
-        scores = ChainMap(*(measure.add_frame(frame) for measure in measures))
-        rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds, **scores))
+        scores = ViewScores.mean(list(views.values()))
+        if np.isnan(scores.psnr) or report.num_missing == len(recording.views.train):
+            without_images.append(index)
+        kind = frame.kind.name.lower()
+        errors = motion.scores(frame)
+        rows.append(
+            FrameScores(index, kind, frame.num_bytes, report.seconds, scores, errors, views)
+        )
         if progress is not None:
             progress(len(rows), len(clip.packets))
-    num_fitted = len(recording.views.train)
-    without_images = [
-        row.frame
-        for row in rows
-        if np.isnan(row.scores.psnr) or fitted.get(row.frame, _UNKNOWN)[1] == num_fitted
-    ]
     num_bytes = stream.path.stat().st_size
     sizes = Sizes(
         file=num_bytes,
@@ -114,23 +131,22 @@ def evaluate_stream(
         without_images=tuple(without_images),
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=sizes,
+        variation=VariationScores.mean([each.result() for each in variations.values()]),
         playback=PlaybackTimes(**playback),
+        psnr_slope=slope([row.scores.psnr for row in rows]),
         frames=tuple(rows),
-        **ChainMap(*(measure.result() for measure in measures)),
     )
 
 
-def _fitted(stream: Path) -> dict[int, tuple[float | None, int, Sequence[str]]]:
-    """Return seconds, number of views without an image and the images' fingerprints, by frame, from
-    the report beside the stream; empty without one.
-    """
+def _fitted(stream: Path) -> dict[int, _FitReport]:
+    """Return what the report beside the stream has on each frame; empty without one."""
     path = stream.with_name(REPORT)
     if not path.is_file():
         return {}
     report = read_json(path)
     try:
         return {
-            row["frame"]: (
+            row["frame"]: _FitReport(
                 float(row["seconds"]),
                 len(row.get("missing_views", ())),
                 tuple(row.get("fingerprints", ())),

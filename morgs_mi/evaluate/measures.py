@@ -1,7 +1,4 @@
-"""The measures of an evaluation, each of one kind of score.
-
-A measure is given the frames in order, each view by view. It returns the scores of a frame, as
-fields of `FrameScores`, and at the end the scores of the clip, as fields of `Evaluation`.
+"""Scores of a view, and errors in 3D of a frame.
 
 Every score is one number per view and frame. Frames average over views and the clip over frames;
 NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the score of a region.
@@ -12,7 +9,6 @@ until the next. Otherwise it is the pixels in which the recording changed by mor
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -25,105 +21,53 @@ from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedVi
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import (
     WINDOW,
-    StillVariation,
     delta_e_map,
     endpoint_error,
     iou,
     mean_over,
     psnr_mu,
     psnr_of,
-    slope,
     ssim_map,
     unit_pair,
 )
 from morgs_mi.evaluate.motion3d import evaluate_motion
-from morgs_mi.evaluate.results import VariationScores, ViewScores
+from morgs_mi.evaluate.results import Motion3DScores, ViewScores
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.platform.checks import valid_pixels
 
-Fields: TypeAlias = dict[str, Any]
-"""Fields of a result by their names."""
 REGIONS = ("", "_moving", "_still")
-# Compression flickers: after a hundred frames half the pixels of a real recording have changed
-# once.
-_FALSE_ALARMS = 0.02
 
 
-class Measure:
-    """Base of the measures."""
-
-    def add_view(self, view: ComparedView) -> None:
-        """Add a view of the next frame."""
-
-    def add_frame(self, frame: ComparedFrame) -> Fields:
-        """Add the next frame, after its views; return its scores as fields of `FrameScores`."""
-        return {}
-
-    def result(self) -> Fields:
-        """Return the scores of the clip as fields of `Evaluation`."""
-        return {}
-
-
-class Quality(Measure):
-    """Scores of the rendered images, motion and confidence, view by view.
+def view_scores(view: ComparedView, lpips: Lpips | None) -> ViewScores:
+    """Return the scores of a view's rendered image, motion and confidence.
 
     Args:
+        view: the view.
         lpips: network for LPIPS; without one there is no LPIPS.
     """
-
-    def __init__(self, lpips: Lpips | None) -> None:
-        self._lpips = lpips
-        self._views: dict[str, ViewScores] = {}
-        self._psnr: list[float] = []
-
-    def add_view(self, view: ComparedView) -> None:
-        scores = _image_scores(view, self._lpips)
-        # A keyframe has no motion.
-        if view.frame.kind == PacketKind.RESIDUAL and view.truth is not None:
-            motion = view.maps["motion"]
-            true = view.truth.motion
-            mask = view.truth.mask
-            scores |= {
-                "motion_error": endpoint_error(motion, true),
-                "motion_error_moving": endpoint_error(motion, true, mask),
-                "motion_error_still": endpoint_error(motion, true, ~mask),
-                "true_motion_moving": endpoint_error(np.zeros_like(motion), true, mask),
-            }
-            if "confidence" in view.maps:
-                scores["confidence_iou"] = iou(view.maps["confidence"][..., 0] > 0.5, mask)
-        self._views[view.camera.name] = ViewScores(**scores)
-
-    def add_frame(self, frame: ComparedFrame) -> Fields:
-        names = [frame.clip.cameras[view].name for view in frame.clip.views]
-        views = {name: self._views.pop(name, ViewScores()) for name in names}
-        mean = ViewScores.mean(list(views.values()))
-        self._psnr.append(mean.psnr)
-        return {"scores": mean, "views": views}
-
-    def result(self) -> Fields:
-        return {"psnr_slope": slope(self._psnr)}
-
-
-class Variation(Measure):
-    """Variation of the static pixels, see `StillVariation`."""
-
-    def __init__(self, clip: ComparedClip) -> None:
-        false_alarms = _FALSE_ALARMS if clip.recording.truth is None else 0
-        self._views = {
-            view: StillVariation(clip.recording.masks[view], false_alarms) for view in clip.views
+    scores = _image_scores(view, lpips)
+    # A keyframe has no motion.
+    if view.frame.kind == PacketKind.RESIDUAL and view.truth is not None:
+        motion = view.maps["motion"]
+        true = view.truth.motion
+        mask = view.truth.mask
+        scores |= {
+            "motion_error": endpoint_error(motion, true),
+            "motion_error_moving": endpoint_error(motion, true, mask),
+            "motion_error_still": endpoint_error(motion, true, ~mask),
+            "true_motion_moving": endpoint_error(np.zeros_like(motion), true, mask),
         }
-
-    def add_view(self, view: ComparedView) -> None:
-        moving = np.zeros(view.recorded.shape[:2], bool) if view.moving is None else view.moving
-        self._views[view.index].add(view.rendered, view.recorded, moving)
-
-    def result(self) -> Fields:
-        return {"variation": VariationScores.mean([view.result() for view in self._views.values()])}
+        if "confidence" in view.maps:
+            scores["confidence_iou"] = iou(view.maps["confidence"][..., 0] > 0.5, mask)
+    return ViewScores(**scores)
 
 
-class Motion3D(Measure):
+class Motion3D:
     """Errors in 3D of the Gaussians that exist in a frame and in the frame before, see
     `evaluate_motion`.
+
+    Args:
+        clip: the clip, of which all frames are given in order.
     """
 
     def __init__(self, clip: ComparedClip) -> None:
@@ -134,7 +78,8 @@ class Motion3D(Measure):
             self._tracks = load_tracks(self._truth)
         self._last_state: FrameState | None = None
 
-    def add_frame(self, frame: ComparedFrame) -> Fields:
+    def scores(self, frame: ComparedFrame) -> Motion3DScores | None:
+        """Return the scores of the next frame; None without tracks or a previous frame."""
         last_state = self._last_state
         state = frame.state
         self._last_state = state
@@ -146,7 +91,7 @@ class Motion3D(Measure):
             or self._truth is None
             or state.frame >= tracks.points.shape[1]
         ):
-            return {"motion_3d": None}
+            return None
         views = []
         for camera in self._cameras:
             truth = load_truth(self._truth, camera.name, state.frame - 1)
@@ -156,19 +101,19 @@ class Motion3D(Measure):
         new = state.gaussians.numpy()["means"][rows].astype(float)
         opacities = np.asarray(last_state.gaussians.opacities)[last_rows]
         points = tracks.points[:, state.frame - 1], tracks.points[:, state.frame], tracks.ids
-        return {"motion_3d": evaluate_motion(old, new - old, opacities, points, views)}
+        return evaluate_motion(old, new - old, opacities, points, views)
 
 
 def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
     """Return the scores of a rendered image by metric and region."""
     rendered = view.rendered
     whole = valid_pixels(view.valid, rendered.shape)
-    moving = np.zeros_like(whole) if view.moving is None else whole & view.moving
-    still = np.zeros_like(whole) if view.moving is None else whole & ~moving
-    regions = {"": whole, "_moving": moving, "_still": still}
+    regions = {"": whole}
+    if view.moving is not None:
+        regions |= {"_moving": whole & view.moving, "_still": whole & ~view.moving}
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
     exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
-    scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), regions[""]))}
+    scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), whole))}
     if view.light is not None:
         scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
     if view.nearest is not None:
@@ -183,12 +128,12 @@ def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
     if lpips is not None:
         distance = lpips.distance_map(rendered, view.recorded)
         of_image = distance.shape != a.shape[:2]
-        scores |= _by_region("lpips", distance, {"": None} if of_image else regions)
+        scores |= {"lpips": distance.item()} if of_image else _by_region("lpips", distance, regions)
     return scores
 
 
 def _by_region(
-    name: str, values: np.ndarray, regions: Mapping[str, np.ndarray | None]
+    name: str, values: np.ndarray, regions: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
-    """Return the mean of a map over each region, which is all of it for None."""
+    """Return the mean of a map over each region."""
     return {name + region: mean_over(values, mask) for region, mask in regions.items()}

@@ -219,23 +219,19 @@ class StillVariation:
         self._valid = valid
         self._false_alarms = false_alarms
         self._frames = 0
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
-        self._sums: list[np.ndarray] = []
+        self._last: np.ndarray | None = None  # rendered and recorded image [2, H, W, 3]
+        self._sums = np.zeros((2, 1, 1))  # of the changes of both
         self._motion_counts = np.zeros((1, 1), int)
 
-    def add(self, image: np.ndarray, recorded: np.ndarray, moving: np.ndarray) -> None:
+    def add(self, image: np.ndarray, recorded: np.ndarray, moving: np.ndarray | None) -> None:
         """Add the next frame: rendered and recorded image [H, W, 3], and the mask of moving pixels
-        [H, W] bool.
+        [H, W] bool; None: none.
         """
-        pair = unit_pair("StillVariation.add", image, recorded, moving)
-        self._motion_counts = self._motion_counts + moving
+        pair = np.stack(unit_pair("StillVariation.add", image, recorded, moving))
+        self._motion_counts = self._motion_counts + (0 if moving is None else moving)
         self._frames += 1
         if self._last is not None:
-            sums = self._sums or (0, 0)
-            self._sums = [
-                total + np.abs(new - old).mean(-1)
-                for total, new, old in zip(sums, pair, self._last, strict=True)
-            ]
+            self._sums = self._sums + np.abs(pair - self._last).mean(-1)
         self._last = pair
 
     def result(self) -> VariationScores:
@@ -244,11 +240,10 @@ class StillVariation:
         """
         if self._frames < 2:
             return VariationScores()
-        valid = valid_pixels(self._valid, self._motion_counts.shape)
+        valid = valid_pixels(self._valid, self._sums.shape[1:])
         still = (self._motion_counts <= self._false_alarms * self._frames) & valid
-        render, recorded = (
-            100 * mean_over(total, still) / (self._frames - 1) for total in self._sums
-        )
+        render = 100 * mean_over(self._sums[0], still) / (self._frames - 1)
+        recorded = 100 * mean_over(self._sums[1], still) / (self._frames - 1)
         return VariationScores(render, recorded, float(still.sum() / max(valid.sum(), 1)))
 
 

@@ -51,12 +51,11 @@ def evaluate_motion(
         views: cameras with their ground truth at t-1.
     """
     ids = surface_ids(means, views)
-    rigid = rigid_motions(*tracks)
+    starts, ends, objects = tracks
     true = np.zeros_like(means, float)
     mask = np.zeros(len(means), bool)
-    for index, (rotation, shift) in rigid.items():
-        starts, ends = (points[tracks[2] == index] for points in tracks[:2])
-        longest = np.linalg.norm(ends - starts, axis=-1).max()
+    for index, (rotation, shift) in rigid_motions(starts, ends, objects).items():
+        longest = np.linalg.norm(ends - starts, axis=-1)[objects == index].max()
         on = (ids == index) & (opacities >= _LEAST_OPACITY)
         true[on] = means[on] @ (rotation - np.eye(3)).T + shift
         mask |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)

@@ -191,11 +191,10 @@ class Evaluation:
     def as_dict(self) -> JsonObject:
         """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""
         means = asdict(self.scores)
+        first = asdict(self.frames[0].scores)
+        last = asdict(self.frames[-1].scores)
         for name in ("psnr", "ssim"):
-            first, last = (
-                getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1])
-            )
-            means[name] = {"mean": means[name], "first": first, "last": last}
+            means[name] = {"mean": means[name], "first": first[name], "last": last[name]}
         sources = ("stream", "capture", "held_out", "between_cameras")
         names = (*sources, "num_frames", "complete", "without_images", "regions")
         return {

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from morgs_mi.evaluate.measures import REGIONS
-from morgs_mi.evaluate.results import Evaluation
+from morgs_mi.evaluate.results import Evaluation, ViewScores
 
 # Title, name of the score and decimals. Some scores are of the whole image alone.
 _METRICS = (
@@ -50,25 +50,16 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     evaluated = f"{kind} views" if len(result.views) > 1 else f"{kind} view {names}"
     table = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result.frames:
-        scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
-        table.add_row(
-            str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1)
-        )
+        costs = (figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1))
+        table.add_row(str(row.frame), *_cells(row.scores, _FRAME), *costs)
     yield table
     if len(result.views) > 1:
-        rows = {
-            name: asdict(scores)
-            for name, scores in (*result.views.items(), ("mean", result.scores))
-        }
-        columns = [
-            (title, name, digits)
-            for title, name, digits in _VIEW
-            if any(figure(row[name], 0) != "-" for row in rows.values())
-        ]
+        # A score that the mean of all views lacks, no view has.
+        columns = [row for row in _VIEW if not np.isnan(getattr(result.scores, row[1]))]
         title = f"{evaluated}, means over the frames"
         table = _table(title, "", *(title for title, *_ in columns))
-        for name, row in rows.items():
-            table.add_row(name, *(figure(row[score], digits) for _, score, digits in columns))
+        for name, scores in {**result.views, "mean": result.scores}.items():
+            table.add_row(name, *_cells(scores, columns))
         yield table
     title = f"{evaluated}: means, regions from {result.regions}"
     table = _table(title, "", "whole", "moving", "still")
@@ -85,9 +76,10 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
     """Yield sentences on time, size, drift, 3D motion and, last, views that were not fitted."""
-    first, last = (result.frames[k].scores.psnr for k in (0, -1))
+    first = figure(result.frames[0].scores.psnr, 2)
+    last = figure(result.frames[-1].scores.psnr, 2)
     yield (
-        f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
+        f"Drift: PSNR {first} dB in the first frame, {last} dB in the last, "
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
     if result.held_out:
@@ -128,6 +120,11 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
             if result.between_cameras
             else "These views were fitted."
         )
+
+
+def _cells(scores: ViewScores, columns: Sequence[tuple[str, str, int]]) -> list[str]:
+    """Return the scores of a row, given title, name and decimals of each column."""
+    return [figure(getattr(scores, name), digits) for _, name, digits in columns]
 
 
 def _table(title: str, first: str, *columns: str) -> Table:
