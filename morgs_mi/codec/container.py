@@ -145,7 +145,9 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
         text = str(data, "utf-8")
         if sum(map(text.count, ",[{")) > _MAX_MARKS:
             raise ValueError(f"it must have at most {_MAX_MARKS} commas and opening brackets")
-        value = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_number)
+        value = json.loads(
+            text, parse_constant=_finite_number, parse_float=_finite_number, parse_int=_integer
+        )
         if _levels(value) > _MAX_LEVELS:
             raise ValueError(f"it must be nested at most {_MAX_LEVELS} levels deep")
     except (ValueError, RecursionError) as error:
@@ -153,12 +155,17 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
     return value
 
 
-def _number(text: str) -> float:
-    """Return a finite number, or an integer of at most 64 bits."""
-    number = int(text) if text.lstrip("-").isdecimal() else float(text)
-    is_short = -(2**63) <= number < 2**64 if isinstance(number, int) else math.isfinite(number)
-    if not is_short:
-        raise ValueError(f"numbers must be finite, integers of at most 64 bits, got {text:.40}")
+def _finite_number(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"numbers must be finite, got {text:.40}")
+    return number
+
+
+def _integer(text: str) -> int:
+    number = int(text)
+    if not -(2**63) <= number < 2**64:
+        raise ValueError(f"integers must have at most 64 bits, got {text:.40}")
     return number
 
 

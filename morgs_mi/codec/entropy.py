@@ -44,7 +44,7 @@ class ColumnWriter:
         tokens, bits, rest = _tokens(values)
         counts = _PRIOR.copy()
         for block in _blocks(len(tokens)):
-            self._encoder.encode(tokens[block], _model(counts) if block.start else _FIRST)
+            self._encoder.encode(tokens[block], _model(counts))
             counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
         for shift, some, num_values in _halves(bits):
             half = (rest[some] >> shift) & (2**_LOW - 1)
@@ -76,8 +76,7 @@ class ColumnReader:
         counts = _PRIOR.copy()
         try:
             for block in _blocks(count):
-                model = _model(counts) if block.start else _FIRST
-                tokens[block] = self._decoder.decode(model, block.stop - block.start)
+                tokens[block] = self._decoder.decode(_model(counts), block.stop - block.start)
                 counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
             size = (tokens + 1) // 2  # the magnitude m of the module
             if np.any(size >= _DIRECT):
@@ -141,6 +140,3 @@ def _halves(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
 
 def _model(counts: np.ndarray) -> Any:
     return _MODEL.Categorical(counts.astype(np.float64), perfect=False)
-
-
-_FIRST = _model(_PRIOR)  # of the first block of every column

@@ -26,7 +26,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate
 from math import prod
 
 import numpy as np
@@ -108,11 +107,12 @@ class Grid:
 
     def concatenate(self, other: Grid) -> Grid:
         """Return these Gaussians followed by `other`, which has the same columns."""
-        both = {
-            n: np.concatenate([getattr(self, n), getattr(other, n)])
-            for n in ("values", "exponents", "largest_components")
-        }
-        return replace(self, **both)
+        return replace(
+            self,
+            values=np.concatenate([self.values, other.values]),
+            exponents=np.concatenate([self.exponents, other.exponents]),
+            largest_components=np.concatenate([self.largest_components, other.largest_components]),
+        )
 
     def gaussians(self, motion: np.ndarray | None = None) -> Gaussians:
         """Return the Gaussians that the integers stand for.
@@ -191,11 +191,12 @@ def num_integers(degree: int, optional: int) -> int:
 
 
 def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
-    ends = accumulate(widths.values())
-    return {
-        name: slice(end - width, end)
-        for (name, width), end in zip(widths.items(), ends, strict=True)
-    }
+    slices = {}
+    first = 0
+    for name, width in widths.items():
+        slices[name] = slice(first, first + width)
+        first += width
+    return slices
 
 
 def step_sizes(exponents: np.ndarray) -> np.ndarray:
@@ -285,24 +286,25 @@ def _exponents(raw: Arrays, cameras: Sequence[Camera], config: CodecConfig) -> n
     """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config`
     tolerates.
     """
-    precision = config.quality * config.birth_precision
-    error, color = (2 * _ERRORS[name] / precision for name in ("means", "sh_dc"))
-    pixel = _world_per_pixel(raw["means"], cameras)
-    ones = np.ones(len(pixel))
-    sizes = np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None]
+    error = _doubled_error("means", config)
+    color = _doubled_error("sh_dc", config)
+    pixel = _world_per_pixel(raw["means"], cameras)[:, None]
+    one = np.ones_like(pixel)
+    sizes = np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel
     sizes = np.maximum(sizes, _MIN_SIZE_PX)
     # A ball tolerates any turn.
-    elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)
-    magnitudes = {name: np.abs(value) for name, value in raw.items()}
-    # Of each exponent: step of all Gaussians, factor and largest absolute value of each one [N].
+    elongation = np.sqrt(sizes.max(1, keepdims=True) ** 2 - sizes.min(1, keepdims=True) ** 2)
+    elongation = np.maximum(elongation, _MIN_SIZE_PX)
+    # Of each group: step of all Gaussians, factor and largest absolute value of each one, [N, 1],
+    # or [N, 3] for the axes of `log_scales`.
     rules = [
-        (error, pixel, magnitudes["means"].max(1)),
-        *zip([error] * 3, 1 / sizes.T, magnitudes["log_scales"].T, strict=True),
-        (error / 2, 1 / elongation, ones),  # quats: a turn by a changes tan(a / 2)
-        (_generic_step("logit_opacities", config), ones, ones),
-        (color / SH_C0, ones, magnitudes["sh_dc"].max((1, 2))),
-        (color, ones, magnitudes["sh_rest"].max((1, 2), initial=0)),
-        *((_generic_step(name, config), ones, ones) for name in optional_names(optional_mask(raw))),
+        (error, pixel, np.abs(raw["means"]).max(1, keepdims=True)),
+        (error, 1 / sizes, np.abs(raw["log_scales"])),
+        (error / 2, 1 / elongation, one),  # quats: a turn by a changes tan(a / 2)
+        (_generic_step("logit_opacities", config), one, one),
+        (color / SH_C0, one, np.abs(raw["sh_dc"]).max((1, 2))[:, None]),
+        (color, one, np.abs(raw["sh_rest"]).max((1, 2), initial=0)[:, None]),
+        *((_generic_step(name, config), one, one) for name in optional_names(optional_mask(raw))),
     ]
     columns = []
     for step, factor, magnitude in rules:
@@ -312,7 +314,12 @@ def _exponents(raw: Arrays, cameras: Sequence[Camera], config: CodecConfig) -> n
         # without bound.
         finest = np.ceil(4 * (np.log2(np.maximum(magnitude, 1e-38)) - _MAX_BITS))
         columns.append(np.maximum(e, finest))
-    return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
+    return np.clip(np.concatenate(columns, axis=1), -128, 127).astype(np.int8)
+
+
+def _doubled_error(name: str, config: CodecConfig) -> float:
+    """Return twice the error that is tolerated in the activated value of an attribute."""
+    return 2 * _ERRORS[name] / (config.quality * config.birth_precision)
 
 
 def _generic_step(name: str, config: CodecConfig) -> float:
@@ -321,8 +328,7 @@ def _generic_step(name: str, config: CodecConfig) -> float:
 
     Where the slope of the activation has no bound, the error applies to the optimised value.
     """
-    precision = config.quality * config.birth_precision
-    return 2 * _ERRORS[name] / precision / (_STORED[name].activation.largest_slope or 1.0)
+    return _doubled_error(name, config) / (_STORED[name].activation.largest_slope or 1.0)
 
 
 def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

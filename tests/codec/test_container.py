@@ -164,7 +164,7 @@ def with_table(table, rest=b""):
             with_table(b'[["a", "uint8", [1]], ["a", "uint8", [1]]]', bytes(2)),
             r"`a` is declared as uint8 \[1\]",
         ),
-        (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, .* got NaN"),
+        (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, got NaN"),
         (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
         (with_table(b'[["a", "object", [1]]]', bytes(8)), "table of arrays is broken"),
         (
@@ -173,7 +173,7 @@ def with_table(table, rest=b""):
         ),
         (
             with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'),
-            "integers of at most 64 bits",
+            "integers must have at most 64 bits",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

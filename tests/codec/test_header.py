@@ -52,10 +52,10 @@ def with_entry(path, text):
 @pytest.mark.parametrize(
     ("path", "text", "message"),
     [
-        ("fps", "1e999", "numbers must be finite, .* got 1e999"),
+        ("fps", "1e999", "numbers must be finite, got 1e999"),
         ("fps", "0", "`fps` must be a number from 1e-6 to 1e6, got 0"),
         ("fps", "true", "`fps` must be a number .* got True"),
-        ("fps", "1" + 400 * "0", "integers of at most 64 bits, got 1000"),
+        ("fps", "1" + 400 * "0", "integers must have at most 64 bits, got 1000"),
         ("cameras", "[]", "`cameras` must be a list of at least one camera"),
         ("cameras.1", "7", r"`cameras\[1\].name` must be a string, got None"),
         ("cameras.0.K.0.0", "-1", "must be finite with positive focal lengths"),
