@@ -418,8 +418,7 @@ def _block_bits(
         for k, entry in enumerate(entries):
             log2_transmittance = dr.gather(mi.Float64, behind, entry, is_listed[k]) - start
             is_listed[k] &= ~(log2_transmittance < least)
-    pairs = zip(entries, is_listed, strict=True)
-    masks = [dr.gather(mi.UInt32, mask, entry, active) for entry, active in pairs]
+    masks = [dr.gather(mi.UInt32, mask, entries[k], is_listed[k]) for k in range(32)]
     words = dr.empty(mi.UInt32, num_words * 32)
     for k, row in enumerate(_transposed(masks)):
         dr.scatter(words, row, word * 32 + k, mode=dr.ReduceMode.NoConflicts)

@@ -109,10 +109,7 @@ class _Blend(dr.CustomOp):
 
     def _outputs(self, images: list[Float]) -> list[Float]:
         """Return the images without the padding to whole blocks, and alpha twice."""
-        outputs = [
-            _cropped(v, self.region, size)
-            for v, size in zip(images, self.layout.sizes, strict=True)
-        ]
+        outputs = [_cropped(image, self.region) for image in images]
         return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
 
 
@@ -162,14 +159,14 @@ def record_gradients(
     firsts = [lane + k * section_size for k in range(num_sections)]
     start = 0 if layout.reaches_weights else layout.geometry
     stop = layout.geometry + layout.columns + 2 * layout.absolute
-    parts = ([elements(sums, first + k) for first in firsts] for k in range(start, stop))
-    return [sum(rest, total) for total, *rest in parts]
+    return [sum(elements(sums, first + k) for first in firsts) for k in range(start, stop)]
 
 
-def _cropped(image: Float, region: DrawnBlocks, size: int) -> Float:
+def _cropped(image: Float, region: DrawnBlocks) -> Float:
     """Return a flat image without the columns of pixels that pad it to whole blocks."""
     if not region.whole or region.row == region.width:
         return image
+    size = dr.width(image) // region.num_pixels
     lane = dr.arange(mi.UInt32, region.width * region.height * size)
     row = quotient(lane, region.width * size)
     return elements(image, lane + row * opaque(mi.UInt32, (region.row - region.width) * size))

@@ -67,7 +67,7 @@ def recorded(function: Callable[..., Jit], *static: object) -> Callable[..., Jit
         # Dr.Jit holds its own lock while it inspects the arguments. For a dataclass that runs
         # Python code, in which another thread can get the interpreter's lock and then wait for
         # Dr.Jit's: a deadlock.
-        plain = [vars(a) if c else a for a, c in zip(arguments, classes, strict=True)]
+        plain = [vars(a) if is_dataclass(a) else a for a in arguments]
         with render_lock:
             # An array that is collected while Dr.Jit inspects the arguments waits for Dr.Jit's lock
             # forever.

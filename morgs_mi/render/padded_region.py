@@ -47,19 +47,9 @@ class PaddedRegion(DrawnBlocks):
 
     def __init__(self, sizes: PaddedSizes, arrays: Mapping[str, Jit]) -> None:
         vars(self).update(arrays)
-        self.block = sizes.grid.block
-        self.across, self.down = sizes.grid.tiles
-        self.width = sizes.grid.width
-        self.height = sizes.grid.height
-        self.whole = sizes.whole
-        self.num_blocks = sizes.num_blocks
+        super().__init__(sizes.grid, sizes.num_blocks, sizes.whole)
         self.num_tiles = sizes.num_tiles
         self.capacity = sizes.capacity
-        block_width, block_height = self.block
-        self.row = -(-self.width // block_width) * block_width if self.whole else block_width
-        self.num_pixels = (
-            self.row * self.height if self.whole else self.num_blocks * block_width * block_height
-        )
         self._counts: UInt32 = arrays["counts"]
         self.weights = None
         if sizes.is_partial:
@@ -81,13 +71,15 @@ def padded_arrays(region: Region, sizes: PaddedSizes) -> dict[str, np.ndarray]:
     """
     blocks = sizes.num_blocks
     host = region.host
-    arrays = {name: filled(host[name], blocks) for name in ("tile", "bit", "y")}
-    arrays["x"] = filled(host["x"], blocks, _BESIDE)
+    block_width, block_height = region.block
     # Blocks without splats are drawn, too, because losses read their pixels.
-    area = region.block[0] * region.block[1]
-    arrays["place"] = host["place"] if region.whole else np.arange(blocks) * (area // 4)
-    arrays["rows"] = filled(host["rows"], blocks, region.block[1])
-    arrays |= {name: host[name] for name in ("pitch", "slot_of", "tile_table")}
+    fills = {"tile": 0, "bit": 0, "x": _BESIDE, "y": 0, "rows": block_height}
+    places = np.arange(blocks) * (block_width * block_height // 4)
+    arrays = {
+        **{name: filled(host[name], blocks, fill) for name, fill in fills.items()},
+        **{name: host[name] for name in ("pitch", "slot_of", "tile_table")},
+        "place": host["place"] if region.whole else places,
+    }
     arrays = {name: np.asarray(values, np.uint32) for name, values in arrays.items()}
     for name in ("corner_x", "corner_y"):
         arrays[name] = filled(host[name], sizes.num_tiles, _FAR)

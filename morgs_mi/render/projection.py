@@ -368,13 +368,13 @@ def project(
     profile = _depth_profile(z, axes, covariance) if "profile" in channels else None
 
     blended: dict[str, tuple[Float, ...]] = {}
-    largest = mi.Float(0)
+    limited: list[Float] = []  # what must be at most 1e18
     attributes = attribute_channels()
     for name in channels:
         if name == "color":
             direction = dr.select(front, mi.Vector3f(world - pose.position), 1)
             coeffs = gaussians.rows("sh_coeffs", rows)
-            largest = _largest(largest, coeffs)
+            limited += coeffs
             blended[name] = tuple(_colors(direction, coeffs))
         elif name == "depth":
             blended[name] = (z,)
@@ -409,18 +409,11 @@ def project(
     # Not finite where any of these values is not.
     values = [v for values in blended.values() for v in values]
     probe += sum(dr.detach([*splats.geometry, *values]))
-    largest = _largest(
-        largest, [v for name, values in blended.items() if name != "depth" for v in values]
-    )
+    largest = mi.Float(0)
+    for value in (*limited, *values):
+        largest = dr.maximum(largest, dr.abs(dr.detach(value)))
     finite = dr.isfinite(probe) & (largest <= FARTHEST)  # pyright: ignore
     return replace(splats, valid=splats.valid & finite, finite=finite)
-
-
-def _largest(bound: Float, values: Sequence[Float]) -> Float:
-    """Return the largest absolute value of numbers, at least `bound`, detached."""
-    for value in values:
-        bound = dr.maximum(bound, dr.abs(dr.detach(value)))
-    return bound
 
 
 def _inverse_rotation(quats: Vector4f) -> Matrix3f:

@@ -68,6 +68,12 @@ class DrawnBlocks:
 
     Images on them are [A, block_height, block_width, C], block by block, A blocks in all, or
     [H, W, C] if they are a `whole` view.
+
+    Args:
+        grid: all blocks of a view.
+        num_blocks: number of those that are drawn.
+        whole: whether they are a whole view.
+        views: number of views, one below the other.
     """
 
     # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in
@@ -85,18 +91,21 @@ class DrawnBlocks:
     corner_x: Float
     corner_y: Float
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
-    width: int  # of the view, px
-    height: int  # of the view, px
-    block: tuple[int, int]  # width and height of a block, px
-    across: int  # tiles of a row of the view
-    down: int  # tiles of a column of the view
-    whole: bool
-    row: int  # pixels of a row in memory
-    num_blocks: int
     num_tiles: int
-    num_pixels: int
     #: Entries of the lists, see `PaddedRegion`; None: as many as needed, which stops the queue.
     capacity: int | None = None
+
+    def __init__(self, grid: BlockGrid, num_blocks: int, whole: bool, views: int = 1) -> None:
+        block_width, block_height = grid.block
+        self.grid = grid
+        self.width = grid.width
+        self.height = views * grid.height
+        self.block = grid.block
+        self.across, self.down = grid.tiles
+        self.whole = whole
+        self.num_blocks = num_blocks
+        self.row = -(-grid.width // block_width) * block_width if whole else block_width
+        self.num_pixels = self.row * (self.height if whole else num_blocks * block_height)
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of an image with `channels` floats per pixel on these blocks."""
@@ -160,12 +169,8 @@ class Region(DrawnBlocks):
         views: int = 1,
         valid: np.ndarray | None = None,
     ) -> None:
-        self.grid = grid
-        self.width = grid.width
-        self.height = views * grid.height
-        self.block = bw, bh = grid.block
-        self.whole = whole
-        self.across, self.down = grid.tiles
+        super().__init__(grid, int(np.count_nonzero(blocks)), whole, views)
+        bw, bh = grid.block
         active = blocks.reshape(-1, DOWN, self.across, ACROSS).transpose(0, 2, 1, 3)
         active = active.reshape(-1, ACROSS * DOWN)
         tiles = np.flatnonzero(active.any(1))
@@ -176,20 +181,15 @@ class Region(DrawnBlocks):
         slots[tiles] = np.arange(len(tiles))
         self.drawn = blocks
         self._blocks = (row, column)
-        self.num_blocks = len(row)
         self.num_tiles = len(tiles)
         view, row_in_view = np.divmod(row, self.down * DOWN)
         x = column * bw
         y = row_in_view * bh
         if self.whole:
             H = self.grid.height
-            self.row = -(-self.width // bw) * bw
-            self.num_pixels = self.row * self.height
             place = (view * H + y) * self.row + x
             rows = np.minimum(H - y, bh)
         else:
-            self.row = bw
-            self.num_pixels = len(x) * bw * bh
             place = np.arange(len(x)) * (bw * bh)
             rows = np.full(len(y), bh)
         self.host = {
