@@ -31,26 +31,14 @@ def pipe(name):
     return damage
 
 
-def truncated(name):
-    def damage(path):
-        data = (path / name).read_bytes()
-        (path / name).write_bytes(data[: len(data) * 2 // 3])
-
-    return damage
-
-
-def empty(name):
-    return lambda path: (path / name).write_bytes(b"")
+def cut(name, size):
+    """Cut a file after some bytes."""
+    return lambda path: (path / name).write_bytes((path / name).read_bytes()[:size])
 
 
 def renamed(path):
     for i, clip in enumerate(sorted(path.glob("*.mkv"))):
         clip.rename(path / f"left{i}.mkv")
-
-
-def headers_only(name):
-    """Cut a video after its headers, before the first frame."""
-    return lambda path: (path / name).write_bytes((path / name).read_bytes()[:600])
 
 
 # ---- damage to calibrations
@@ -66,16 +54,12 @@ def replace(name, old, new):
     return damage
 
 
-def transforms(change):
-    return in_json("transforms.json", change)
+def in_json(name):
+    return lambda change: lambda path: edit(path, change, name)
 
 
-def meta(change):
-    return in_json("train_meta.json", change)
-
-
-def in_json(name, change):
-    return lambda path: edit(path, change, name)
+transforms = in_json("transforms.json")
+meta = in_json("train_meta.json")
 
 
 def pose(index, scale):
@@ -108,11 +92,12 @@ POSES_BOUNDS = {
         ReadConfig(offset={"cam02": 9}),
     ),
     "gaps and no clip": (
-        empty("cam00.mkv"),
+        cut("cam00.mkv", 0),
         "cam00.mkv: expected a video, got 0 bytes",
         ReadConfig(gaps=True),
     ),
-    "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .*no frame can be decoded"),
+    # The headers alone.
+    "clip of no frames": (cut("cam00.mkv", 600), "cam00.mkv: .*no frame can be decoded"),
 }
 BY_FRAME = {
     "pipe": (pipe("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
@@ -264,7 +249,7 @@ DYNAMIC3DGS = {
         meta(moving),
         "camera 10: the pose in frame 2 must equal that in frame 0, .* moving cameras are not",
     ),
-    "broken points": (truncated("init_pt_cld.npz"), "init_pt_cld.npz: expected an array `data`"),
+    "broken points": (cut("init_pt_cld.npz", 300), "init_pt_cld.npz: expected an array `data`"),
 }
 ANIPOSE = {
     "no pose": (
@@ -294,7 +279,7 @@ ANIPOSE = {
     ),
 }
 QUALISYS = {
-    "broken file": (truncated("rig.qca.txt"), "rig.qca.txt: expected XML, got a broken file"),
+    "broken file": (cut("rig.qca.txt", 300), "rig.qca.txt: expected XML, got a broken file"),
     "many elements": (
         lambda path: (path / "rig.qca.txt").write_text("<a>" + "<b/>" * 2_000_000 + "</a>"),
         "got a claim of 2000002 elements and attributes",
@@ -322,7 +307,7 @@ QUALISYS = {
 }
 EASYMOCAP = {
     "no intrinsics": (missing("intri.yml"), "intri.yml: expected the intrinsics, found none; copy"),
-    "broken file": (truncated("extri.yml"), "extri.yml: expected OpenCV's YAML, got a broken file"),
+    "broken file": (cut("extri.yml", 300), "extri.yml: expected OpenCV's YAML, got a broken file"),
     "no map": (
         lambda path: (path / "intri.yml").write_text("%YAML:1.0\n---\n- 1\n"),
         "intri.yml: expected OpenCV's YAML, got a broken file; export it again",

@@ -21,6 +21,7 @@ HEIGHT = 46
 COUNT = 4
 FPS = 25
 DOT = np.array([0.25, 0.2, 0.1])
+LENS = (-0.2, 0.05, 0.003, -0.004, 0.01)  # of OpenCV
 
 
 def make_camera(i, name, shift=0.0):

@@ -54,6 +54,28 @@ def mirrored(color, opacity, n):
     return gaussians, view, image, mirror
 
 
+def lit_scene(gaussians, integrator, z, **ball):
+    """Return a scene of Gaussians before a board at depth z, and of a ball that emits light among
+    them, under a lamp and the sky; `ball` has its material and emitter.
+    """
+    reflectance = {"type": "rgb", "value": [0.3, 0.6, 0.5]}
+    return scene(
+        gaussians,
+        integrator,
+        wall=wall(z, 2, bsdf={"type": "diffuse", "reflectance": reflectance}),
+        ball={"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4, **ball},
+        lamp=LAMP,
+        sky={"type": "constant", "radiance": 0.2},
+    )
+
+
+# Parameters of a `lit_scene` with the steps of central differences.
+LIT = {
+    "wall.bsdf.reflectance.value": 1e-2,
+    "ball.emitter.radiance.value": 1e-2,
+    "lamp.intensity.value": 1e-1,
+    "sky.radiance.value": 1e-2,
+}
 LAMP = {
     "type": "point",
     "position": [1.0, -2.0, -3.0],

@@ -15,9 +15,11 @@ from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import (
     COLOR,
     LAMP,
+    LIT,
     camera,
     cloud,
     glowing,
+    lit_scene,
     render,
     scene,
     slopes_of,
@@ -208,10 +210,7 @@ DIFFERENTIATED = {
     "gaussians.data": 1e-3,
     "gaussians.opacities": 1e-3,
     "gaussians.sh_coeffs": 1e-3,
-    "wall.bsdf.reflectance.value": 1e-2,
-    "ball.emitter.radiance.value": 1e-2,
-    "lamp.intensity.value": 1e-1,
-    "sky.radiance.value": 1e-2,
+    **LIT,
 }
 
 
@@ -221,18 +220,7 @@ def differentiated():
     gaussians = Gaussians.concatenate(
         [cloud(z, 1, seed) for seed, z in enumerate(np.linspace(-0.8, 0.6, 40))]
     )
-    ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4, **glowing()}
-    board = wall(
-        0.05, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}}
-    )
-    return scene(
-        gaussians,
-        "prb",
-        wall=board,
-        ball=ball,
-        lamp=LAMP,
-        sky={"type": "constant", "radiance": 0.2},
-    )
+    return lit_scene(gaussians, "prb", 0.05, **glowing())
 
 
 @pytest.fixture(scope="module")

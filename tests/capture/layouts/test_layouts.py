@@ -258,18 +258,24 @@ JUNK = (
 )
 
 
+# Layouts whose files of calibration are texts, or have some beside them.
+CALIBRATED = [
+    layouts.colmap,
+    layouts.nerfstudio,
+    layouts.dynamic3dgs,
+    layouts.anipose,
+    layouts.qualisys,
+    layouts.easymocap,
+]
+
+
 @pytest.mark.parametrize(
     "build",
     [
         layouts.n3dv,
         lambda path: layouts.n3dv(path, clips=folder_per_camera),
         lambda path: layouts.n3dv(path, clips=folder_per_frame),
-        layouts.colmap,
-        layouts.nerfstudio,
-        layouts.dynamic3dgs,
-        layouts.anipose,
-        layouts.qualisys,
-        layouts.easymocap,
+        *CALIBRATED,
     ],
 )
 def test_load_capture__ignores_what_systems_add(tmp_path, caplog, build):
@@ -287,17 +293,7 @@ def test_load_capture__ignores_what_systems_add(tmp_path, caplog, build):
     assert "__MACOSX" not in caplog.text
 
 
-@pytest.mark.parametrize(
-    "build",
-    [
-        layouts.colmap,
-        layouts.nerfstudio,
-        layouts.dynamic3dgs,
-        layouts.anipose,
-        layouts.qualisys,
-        layouts.easymocap,
-    ],
-)
+@pytest.mark.parametrize("build", CALIBRATED)
 def test_load_capture__reads_texts_of_windows(tmp_path, build):
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')

@@ -18,6 +18,7 @@ from tests.scenes import captures as layouts
 from tests.scenes.captures import (
     DOT,
     HEIGHT,
+    LENS,
     WIDTH,
     assert_dot_is_shown,
     assert_is_rig,
@@ -26,7 +27,6 @@ from tests.scenes.captures import (
 )
 
 NAMES = ("trial_1-camA", "trial_1-camB", "trial_1-camC")
-LENS = (-0.2, 0.05, 0.003, -0.004, 0.01)
 
 
 def test_anipose__reads_cameras_and_their_clips(tmp_path):

@@ -13,14 +13,13 @@ from tests.scenes import captures as layouts
 from tests.scenes.captures import (
     DOT,
     HEIGHT,
+    LENS,
     WIDTH,
     assert_dot_is_shown,
     assert_is_rig,
     dot_clips,
     videos,
 )
-
-LENS = (-0.2, 0.05, 0.003, -0.004, 0.01)
 
 
 @pytest.mark.parametrize("clips", [layouts.folder_per_camera, videos])

@@ -16,9 +16,11 @@ from morgs_mi.testing import assert_close
 from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import (
     LAMP,
+    LIT,
     camera,
     cloud,
     glowing,
+    lit_scene,
     mirrored,
     render,
     scene,
@@ -177,24 +179,11 @@ def test_splat_path__white_splats_around_a_white_ball_in_white_light_are_a_furna
 #  Derivatives
 # --------------------------------------------------------------------------------------------------
 
-DIFFERENTIATED = {
-    "wall.bsdf.reflectance.value": 1e-2,
-    "ball.emitter.radiance.value": 1e-2,
-    "lamp.intensity.value": 1e-1,
-    "sky.radiance.value": 1e-2,
-}
-
 
 @pytest.fixture(scope="module")
 def differentiated():
-    ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4}
-    ball |= {"bsdf": {"type": "diffuse"}, "emitter": {"type": "area", "radiance": 0.7}}
-    board = wall(
-        0.5, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}}
-    )
-    sky = {"type": "constant", "radiance": 0.2}
-    traced = {**TRACED, "max_depth": 4}
-    return scene(cloud(-0.2), traced, wall=board, ball=ball, lamp=LAMP, sky=sky)
+    ball = {"bsdf": {"type": "diffuse"}, "emitter": {"type": "area", "radiance": 0.7}}
+    return lit_scene(cloud(-0.2), {**TRACED, "max_depth": 4}, 0.5, **ball)
 
 
 # A linear loss: noise in the image biases neither its derivative nor differences.
@@ -206,15 +195,15 @@ def loss(image):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", DIFFERENTIATED)
+@pytest.mark.parametrize("name", LIT)
 def test_splat_path__gradients_agree_with_central_differences(differentiated, name):
-    gradient, difference = slopes_of(differentiated, name, DIFFERENTIATED[name], loss, 128)
+    gradient, difference = slopes_of(differentiated, name, LIT[name], loss, 128)
     assert gradient == pytest.approx(difference, rel=3e-2)
 
 
 @pytest.mark.slow
 def test_splat_path__forward_mode_is_dual_to_reverse_mode(differentiated):
-    reverse, forward = slopes_of_both_modes(differentiated, DIFFERENTIATED, mi.TensorXf(WEIGHTS))
+    reverse, forward = slopes_of_both_modes(differentiated, LIT, mi.TensorXf(WEIGHTS))
     assert forward == pytest.approx(reverse, rel=1e-2)
 
 
