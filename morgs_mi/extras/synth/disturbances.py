@@ -75,15 +75,16 @@ def draw_disturbances(
         ValueError: a setting is out of range.
     """
     check_ranges(disturbances, "draw_disturbances()")
-    d = disturbances
-    offsets, ks = (
-        # Not -0.
-        (largest * np.random.default_rng([seed, 3, kind]).uniform(-1, 1, num_cameras) + 0.0)
-        for kind, largest in ((0, d.time_offset), (4, d.distortion))
-    )
+
+    def draws(largest: float, stream: int) -> np.ndarray:
+        rng = np.random.default_rng([seed, 3, stream])
+        return largest * rng.uniform(-1, 1, num_cameras) + 0.0  # not -0
+
+    offsets = draws(disturbances.time_offset, 0)
     offsets[0] = 0
-    pairs = zip(offsets.tolist(), ks.tolist(), strict=True)
-    return tuple(CameraDisturbance(offset, float(d.rolling_shutter), k) for offset, k in pairs)
+    pairs = np.stack([offsets, draws(disturbances.distortion, 4)], axis=1).tolist()
+    shutter = float(disturbances.rolling_shutter)
+    return tuple(CameraDisturbance(offset, shutter, k) for offset, k in pairs)
 
 
 def save_disturbances(folder: Path, cameras: Mapping[str, CameraDisturbance]) -> None:

@@ -110,22 +110,11 @@ def synthesize(
     scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
     completed = config.completed(scene.recording)
     assert completed.cameras is not None
-    cameras = scene.rig.cameras(completed.cameras, config.width, config.height)
-    disturbed = draw_disturbances(config.disturbances, len(cameras), config.seed)
-    rig = _Rig(cameras, disturbed, completed)
-    for camera, item in zip(rig.cameras, rig.disturbed, strict=True):
-        if item.distortion < 0:
-            corner = np.linalg.norm(camera.K[:2, 2] / np.diag(camera.K)[:2])
-            # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
-            largest = 2 / (3 * np.sqrt(-3 * item.distortion))
-            require(
-                corner < 0.98 * largest,
-                "synthesize()",
-                "`distortion` must be small enough for the field of view",
-                f"{item.distortion:.3g} with corners at the radius {corner:.3g}, which must be "
-                f"below {largest:.3g}",
-                "set a smaller one",
-            )
+    views = scene.rig.cameras(completed.cameras, config.width, config.height)
+    disturbances = draw_disturbances(config.disturbances, len(views), config.seed)
+    rig = _Rig(list(map(_RecordingCamera, views, disturbances)), completed)
+    for camera in rig.cameras:
+        camera.check_distortion()
     check_scene(scene, rig.times())
     out = Path(out)
     is_empty = out.is_dir() and all(is_added(file.name) for file in out.iterdir())
@@ -138,7 +127,7 @@ def synthesize(
     with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
         tracer = PathTracer(scene)
-        _check_views(tracer, rig.cameras)
+        _check_views(tracer, rig.views)
         clips = _write_clips(tracer, rig, folder, progress)
         _write_truth(tracer, rig, folder / "truth")
         _write_calibration(tracer, rig, clips, folder)
@@ -154,12 +143,65 @@ def synthesize(
 
 
 @dataclass(frozen=True)
+class _RecordingCamera:
+    """A camera that records a scene."""
+
+    view: Camera  # without distortion
+    disturbance: CameraDisturbance
+
+    def check_distortion(self) -> None:
+        """Raise `ValueError` if the lens folds the corners of the view."""
+        k = self.disturbance.distortion
+        if k < 0:
+            corner = np.linalg.norm(self.view.K[:2, 2] / np.diag(self.view.K)[:2])
+            # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
+            largest = 2 / (3 * np.sqrt(-3 * k))
+            require(
+                corner < 0.98 * largest,
+                "synthesize()",
+                "`distortion` must be small enough for the field of view",
+                f"{k:.3g} with corners at the radius {corner:.3g}, which must be below "
+                f"{largest:.3g}",
+                "set a smaller one",
+            )
+
+    def light(self, tracer: PathTracer, frame: int, config: SynthConfig) -> np.ndarray:
+        """Return the light of a frame that the camera with its clock, shutter and lens receives,
+        linear [H, W, 3].
+
+        Args:
+            tracer: the scene; its time is changed.
+            frame: index of the frame.
+            config: samples per pixel, their seed and the frame rate.
+        """
+        assert config.spp is not None
+        disturbance = self.disturbance
+        height = self.view.height
+        if not disturbance.rolling_shutter and not disturbance.distortion:
+            tracer.set_time((frame + disturbance.time_offset) / config.fps)
+            return tracer.light(self.view, config.spp, config.seed)
+        row_times = disturbance.row_times(frame, height)
+        count = -(-height // _BAND) if disturbance.rolling_shutter else 1
+        bands = []
+        for band, rows in enumerate(np.array_split(np.arange(height), count)):
+            tracer.set_time(row_times[rows].mean() / config.fps)
+            seed = _mixed_seed(config.seed, band)
+            light = tracer.light_of_rows(self.view, rows, config.spp, seed, disturbance.lens)
+            bands.append(light)
+        return np.concatenate(bands)
+
+
+@dataclass(frozen=True)
 class _Rig:
     """Cameras that record a scene."""
 
-    cameras: Sequence[Camera]  # cameras without distortion
-    disturbed: Sequence[CameraDisturbance]  # disturbance of each camera
+    cameras: Sequence[_RecordingCamera]
     config: SynthConfig  # complete settings
+
+    @property
+    def views(self) -> list[Camera]:
+        """The cameras without disturbances."""
+        return [camera.view for camera in self.cameras]
 
     def times(self) -> list[float]:
         """Return the times of the frames, the time after the last one, and the extreme times of
@@ -167,8 +209,8 @@ class _Rig:
         """
         ends = (0, 0), (self.config.frames, -1)
         times = [
-            camera.row_times(frame, self.config.height)[row]
-            for camera in self.disturbed
+            camera.disturbance.row_times(frame, self.config.height)[row]
+            for camera in self.cameras
             for frame, row in ends
         ]
         return [
@@ -182,37 +224,6 @@ def _mixed_seed(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
-def _record_light(
-    tracer: PathTracer,
-    camera: Camera,
-    disturbance: CameraDisturbance,
-    frame: int,
-    config: SynthConfig,
-) -> np.ndarray:
-    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear
-    [H, W, 3].
-
-    Args:
-        tracer: the scene; its time is changed.
-        camera: the view without distortion.
-        disturbance: of the camera.
-        frame: index of the frame.
-        config: samples per pixel, their seed and the frame rate.
-    """
-    assert config.spp is not None
-    if not disturbance.rolling_shutter and not disturbance.distortion:
-        tracer.set_time((frame + disturbance.time_offset) / config.fps)
-        return tracer.light(camera, config.spp, config.seed)
-    row_times = disturbance.row_times(frame, camera.height)
-    count = -(-camera.height // _BAND) if disturbance.rolling_shutter else 1
-    bands = []
-    for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
-        tracer.set_time(row_times[rows].mean() / config.fps)
-        seed = _mixed_seed(config.seed, band)
-        bands.append(tracer.light_of_rows(camera, rows, config.spp, seed, disturbance.lens))
-    return np.concatenate(bands)
-
-
 def _write_clips(
     tracer: PathTracer, rig: _Rig, folder: Path, progress: StepReport | None
 ) -> list[Path]:
@@ -222,22 +233,22 @@ def _write_clips(
     assert noise is not None
     count = itertools.count(1)
 
-    def images(index: int, camera: Camera) -> Iterator[np.ndarray]:
+    def images(index: int, camera: _RecordingCamera) -> Iterator[np.ndarray]:
         for frame in range(config.frames):
             # The noise must differ between views and frames; otherwise it would look like a moving
             # texture.
             seed = _mixed_seed(config.seed, index, frame)
-            disturbance = rig.disturbed[index]
-            light = _record_light(tracer, camera, disturbance, frame, replace(config, seed=seed))
+            light = camera.light(tracer, frame, replace(config, seed=seed))
             yield developed(light, noise, seed)
             if progress is not None:
                 progress(next(count), len(rig.cameras) * config.frames)
 
     clips = []
     for index, camera in enumerate(rig.cameras):
-        video = folder / f"{camera.name}.mp4"
+        name = camera.view.name
+        video = folder / f"{name}.mp4"
         if config.lossless:
-            png = folder / "frames" / camera.name
+            png = folder / "frames" / name
             write_video(png, images(index, camera), config.fps)
             write_video(video, open_frames(png).frames(), config.fps, H264)
             clips.append(png)
@@ -280,20 +291,21 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
     """Write the ground truth of every camera, the tracks and the disturbances."""
     fps = rig.config.fps
     frames = np.arange(rig.config.frames)
-    for camera, disturbance in zip(rig.cameras, rig.disturbed, strict=True):
-        times = (frames + disturbance.time_offset) / fps
+    for camera in rig.cameras:
+        view = camera.view
+        times = (frames + camera.disturbance.time_offset) / fps
         old_poses = None
         for frame, time in enumerate(times):
             tracer.set_time(time)
             poses = tracer.poses(time)
-            surface = tracer.surface_points(camera)
+            surface = tracer.surface_points(view)
             next_poses = tracer.poses(time + 1 / fps)
-            truth = compute_ground_truth(camera, surface, poses, old_poses, next_poses)
-            save_truth(folder, camera.name, frame, truth)
+            truth = compute_ground_truth(view, surface, poses, old_poses, next_poses)
+            save_truth(folder, view.name, frame, truth)
             old_poses = poses
     rng = np.random.default_rng([rig.config.seed, 1])
-    save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
-    save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
+    save_tracks(folder, _sample_tracks(tracer, rig.views, frames / fps, rng))
+    save_disturbances(folder, {camera.view.name: camera.disturbance for camera in rig.cameras})
 
 
 def _sample_tracks(
@@ -334,37 +346,37 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
 
     The points have the colours of the `clips`, one per camera.
     """
-    cameras = rig.cameras
-    lenses = [disturbance.lens for disturbance in rig.disturbed]
+    lenses = [camera.disturbance.lens for camera in rig.cameras]
     rng = np.random.default_rng([rig.config.seed, 2])
     points = []
     colors = []
     bounds = []
-    for index, (camera, disturbance) in enumerate(zip(cameras, rig.disturbed, strict=True)):
-        tracer.set_time(disturbance.time_offset / rig.config.fps)
-        lens = undistortion(camera, disturbance.lens)
-        surface = tracer.surface_points(camera)
+    for index, camera in enumerate(rig.cameras):
+        view = camera.view
+        tracer.set_time(camera.disturbance.time_offset / rig.config.fps)
+        lens = undistortion(view, lenses[index])
+        surface = tracer.surface_points(view)
         # The pixels with a surface that the lens shows.
         pixels = np.flatnonzero((surface.ids >= 0) & (lens is None or lens.mask))
         positions = surface.pick(pixels).positions
-        _, depths = camera.project(positions)
+        _, depths = view.project(positions)
         # LLFF's percentiles, which readers of the file expect.
         bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
             continue  # the held-out view must not contribute points or colours
-        most = _NUM_SFM_POINTS // (len(cameras) - 1)
+        most = _NUM_SFM_POINTS // (len(rig.cameras) - 1)
         choice = rng.choice(len(pixels), min(most, len(pixels)), replace=False)
         # Structure from motion has an error of about half a pixel; here it is the same along the
         # ray.
-        pixel_width = depths[choice, None] / camera.K[0, 0]
+        pixel_width = depths[choice, None] / view.K[0, 0]
         points.append(positions[choice] + rng.normal(size=(len(choice), 3)) * (0.5 * pixel_width))
         image = next(open_frames(clips[index]).frames(0, 1))
         image = image if lens is None else lens(image)
         colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)
-    if not any(disturbance.distortion for disturbance in rig.disturbed):
-        write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
+    if not rig.config.disturbances.distortion:
+        write_poses_bounds(folder / "poses_bounds.npy", rig.views, np.array(bounds))
     write_colmap(
-        folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses
+        folder / "sparse" / "0", rig.views, np.concatenate(points), np.concatenate(colors), lenses
     )
 
 
