@@ -372,8 +372,8 @@ def accuracy(
     rng = np.random.default_rng(0)
     # An alpha below 1e-12 changes no float32 image.
     exact = replace(config, alpha_min=1e-12)
-    choosing: list[_Sample] = []
-    checking: list[_Sample] = []
+    # Of each view two samples: the first chooses, the second takes no part in the choice.
+    samples: list[_Sample] = []
     for k, view in enumerate(views):
         alpha = np.array(rasterize(gaussians, view, ("alpha",), config=config).alpha)
         shown = rng.permutation(np.flatnonzero(alpha))[:_PIXELS]
@@ -385,15 +385,13 @@ def accuracy(
             "choose another camera, or one that is nearer",
         )
         # A single pixel serves both.
-        halves = np.array_split(np.resize(shown, max(2, len(shown))), 2)
-        for samples, pixels in zip((choosing, checking), halves, strict=True):
+        for pixels in np.array_split(np.resize(shown, max(2, len(shown))), 2):
             samples.append(_Sample.at(pixels, gaussians, view, exact, rng))
     gaussians = Gaussians(**gaussians.numpy())
     tensors = {name: getattr(gaussians, name) for name in ATTRIBUTES}
     dr.enable_grad(tensors)
 
     configs = {name: replace(config, **change) for name, change in CHANGES.items()}
-    samples = [*choosing, *checking]
     seconds = {name: np.zeros((1 + ROUNDS, len(samples))) for name in configs}
     errors = {name: np.zeros((len(samples), len(_COMPARED))) for name in configs}
     stage = Progress(progress, "Measuring settings")
@@ -415,8 +413,8 @@ def accuracy(
             errors[name][i] = sample.errors(np.array(image), arrays)
     rows = []
     for name, setting in configs.items():
-        largest = errors[name][: len(views)].max(axis=0).tolist()
-        checked = float(errors[name][len(views) :].max())
+        largest = errors[name][::2].max(axis=0).tolist()
+        checked = float(errors[name][1::2].max())
         time_of_image = float(np.median(seconds[name][1:], axis=0).mean())
         by_name = dict(zip(_COMPARED, largest, strict=True))
         rows.append(Setting(name, setting, time_of_image, by_name, checked))

@@ -23,8 +23,7 @@ from morgs_mi.playback.stream_header import open_stream_capture, render_config, 
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.render_config import RenderConfig
 
-# Images of all views [H, W, 3]; None: missing.
-_Images = Sequence[np.ndarray | None]
+_NO_VIEW = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +75,18 @@ class ComparedClip:
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
-        last = None
+        last: Mapping[int, np.ndarray] = {}
         stops = self.recording.display_exposure or 0.0
         # The file may have grown since it was read.
         states = islice(self.stream.states(), len(self.packets))
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
         for state, frame in zip(states, recorded, strict=True):
             kind, num_bytes = self.packets[state.frame]
-            images = [
-                None if image is None else display_image(image, stops) for image in frame.images
-            ]
+            images = {
+                view: display_image(image, stops)
+                for view, image in enumerate(frame.images)
+                if image is not None
+            }
             yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)
             last = images
 
@@ -107,27 +108,25 @@ class ComparedFrame:
     state: FrameState  #: Its Gaussians.
     kind: PacketKind  #: Kind of the frame's packet.
     num_bytes: int  #: Its size.
-    #: Recorded images of all views, as a display shows them; None: missing.
-    images: _Images
-    #: Likewise of the frame before; None in the first one.
-    last: _Images | None
-    recorded: _Images  #: The images as they were recorded.
+    #: Recorded images [H, W, 3] by view, as a display shows them, without missing ones.
+    images: Mapping[int, np.ndarray]
+    last: Mapping[int, np.ndarray]  #: Likewise of the frame before; none in the first one.
+    recorded: Sequence[np.ndarray | None]  #: The images as they were recorded; None: missing.
 
     def views(self) -> Iterator[ComparedView]:
         """Render and yield the evaluated views, except those without an image."""
         clip = self.clip
         for index in clip.views:
             camera = clip.cameras[index]
-            image = self.images[index]
+            image = self.images.get(index)
             if image is not None:
                 maps = render(self.state.gaussians, camera, clip.channels, clip.render)
                 truth = truth_for_camera(clip.recording, camera, self.state.frame)
                 moving = None if truth is None else truth.mask
-                last_image = None if self.last is None else self.last[index]
+                last_image = self.last.get(index)
                 if last_image is not None and clip.recording.truth is None:
                     moving = recorded_change(last_image, image)
-                nearest = clip.nearest.get(index)
-                copy = None if nearest is None else self.images[nearest]
+                copy = self.images.get(clip.nearest.get(index, _NO_VIEW))
                 light = None if clip.recording.display_exposure is None else self.recorded[index]
                 valid = clip.recording.masks[index]
                 yield ComparedView(self, index, maps, image, valid, moving, truth, light, copy)

@@ -9,7 +9,7 @@ NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the sc
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, astuple, dataclass
 from typing import Self
 
 import numpy as np
@@ -23,10 +23,11 @@ _SECONDS = (
 )
 
 
-def known_mean(values: Sequence[float]) -> float:
-    """Return the mean of the values that are not NaN; NaN if there are none."""
-    numbers = [value for value in values if not np.isnan(value)]
-    return float(np.mean(numbers)) if numbers else _NAN
+def known_mean(values: Sequence[float | None] | np.ndarray) -> float:
+    """Return the mean of the values that are neither NaN nor None; NaN if there are none."""
+    numbers = np.array(values, float)
+    known = numbers[~np.isnan(numbers)]
+    return float(known.mean()) if known.size else _NAN
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,7 @@ class _Scores:
     @classmethod
     def mean(cls, scores: Sequence[Self]) -> Self:
         """Return the mean of each field over its known values."""
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: known_mean([getattr(each, name) for each in scores]) for name in names})
+        return cls(*map(known_mean, np.array(list(map(astuple, scores)), float).T))
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ class Evaluation:
     @property
     def seconds(self) -> Timings:
         """Times of the fit."""
-        later_seconds = [frame.seconds for frame in self.frames[1:] if frame.seconds is not None]
-        return Timings(self.frames[0].seconds, known_mean(later_seconds))
+        later_mean = known_mean([frame.seconds for frame in self.frames[1:]])
+        return Timings(self.frames[0].seconds, later_mean)
 
     def as_dict(self) -> JsonObject:
         """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""

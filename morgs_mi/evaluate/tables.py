@@ -65,9 +65,9 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     table = _table(title, "", "whole", "moving", "still")
     mean = result.scores
     for title, name, digits in _METRICS:
-        values = [getattr(mean, name + region, None) for region in REGIONS]
-        if any(figure(value, 0) != "-" for value in values):
-            table.add_row(title, *(figure(value, digits) for value in values))
+        cells = [figure(getattr(mean, name + region, None), digits) for region in REGIONS]
+        if {*cells} != {"-"}:
+            table.add_row(title, *cells)
     if result.variation.render == result.variation.render:
         table.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         table.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
