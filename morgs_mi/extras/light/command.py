@@ -10,6 +10,7 @@ from tyro.conf import arg
 
 from morgs_mi.cli.render import Render, RenderedImages
 from morgs_mi.cli.settings import optional, options
+from morgs_mi.platform.checks import require
 
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
@@ -39,15 +40,24 @@ class RenderWithScene(Render):
     Gaussians, for their shadows and reflections."""
 
     def run(self) -> None:
-        if self.insert is None and self.at is not None:
-            raise ValueError(
-                "--at selects frames of an inserted scene, got no scene; add --insert FILE."
+        if self.insert is None:
+            require(
+                self.at is None, "--at", "expected an inserted scene", "none", "add --insert FILE"
             )
-        if self.insert is not None and self.camera in (None, "all"):
-            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
-        if self.insert is not None and self.background == "transparent":
-            raise ValueError(
-                "--background transparent is for Gaussians alone, got --insert; leave one out."
+        else:
+            require(
+                self.camera not in (None, "all"),
+                "--insert",
+                "expected one camera",
+                "none",
+                "add --camera CAMERA",
+            )
+            require(
+                self.background != "transparent",
+                "--insert",
+                "expected a background behind the Gaussians",
+                "--background transparent",
+                "leave one out",
             )
         super().run()
 

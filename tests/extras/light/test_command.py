@@ -12,15 +12,15 @@ from tests.cli.commands import assert_refused
         (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),
         (
             ["--camera", "0", "--at", "1"],
-            ("--at selects frames of an inserted scene", "add --insert FILE"),
+            ("--at: expected an inserted scene, got none; add --insert FILE",),
         ),
         (
             ["--insert", "no.py"],
-            ("--insert renders for one camera, got none; add --camera CAMERA",),
+            ("--insert: expected one camera, got none; add --camera CAMERA",),
         ),
         (
             ["--camera", "0", "--insert", "no.py", "--background", "transparent"],
-            ("--background transparent is for Gaussians alone, got --insert",),
+            ("--insert: expected a background behind the Gaussians, got --background transparent",),
         ),
     ],
 )
