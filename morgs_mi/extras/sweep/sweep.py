@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.util import find_spec
 from io import BytesIO
 from itertools import product
@@ -192,9 +193,8 @@ def sweep(
     ]
     if not arms:
         raise ValueError("sweep(): expected a config and something to vary, got none; name some.")
-    # The first arm of the same number.
-    places = {(arm.first_alone, arm.point): k for k, arm in reversed([*enumerate(arms)])}
-    reference = np.array([places[arm.first_alone, arm.point] for arm in arms], int)
+    points = [(arm.first_alone, arm.point) for arm in arms]
+    reference = np.array([points.index(point) for point in points], int)  # the first arm there
 
     settings = _reading(capture)
     settings["configs"] = {name: asdict(config) for name, config in configs.items()}
@@ -280,90 +280,75 @@ def leave_out(
     check_value("leave_out()", "tolerance", tolerance, NonNegative)
     capture = _beginning(capture, frames, seeds)
     stage = Progress(progress, "Fitting and evaluating")
-    trial = _Trial(capture, config, tolerance, seeds, Path(out), stage)
+    trial = _Trial(capture, config, tolerance, seeds, Path(out), stage, Fits.of(0, seeds))
     parts = [part for part in PARTS if _without([part], config) != config]
     result = trial.compare("all parts", [[part] for part in parts])
-    needed = dict(zip(parts, result.reasons[1:], strict=True))
-    losses = dict(zip(parts, result.changes.mean[1:, INDEX["psnr"]], strict=True))
-    left_out = [part for part in parts if not needed[part]]
-    while len(left_out) > 1:
+    changes = result.changes.mean[1:, INDEX["psnr"]]
+    rows = zip(parts, result.reasons[1:], changes, strict=True)
+    # Parts that are not needed alone, with the change of the PSNR without each.
+    spare = {part: change for part, reason, change in rows if not reason}
+    while len(spare) > 1:
         # With all parts once more, so that seconds are of fits that ran in turn.
-        result = trial.compare(f"all parts beside {len(left_out)}", [left_out])
+        result = trial.compare(f"all parts beside {len(spare)}", [list(spare)])
         if not result.reasons[-1]:
             break
-        left_out.remove(min(left_out, key=losses.__getitem__))
+        spare.pop(min(spare, key=spare.__getitem__))
+    left_out = list(spare)
     toml = _toml(left_out)
     (Path(out) / "leave-out.toml").write_text(toml, encoding="utf-8")
     sentence = leave_out_sentence(result, left_out, tolerance)
     return trial.write(replace(result, sentence=sentence, toml=toml))
 
 
+@dataclass
 class _Trial:
-    """Fits of a capture with all parts of a method, and without some of them.
+    """Fits of a capture with all parts of a method, and without some of them."""
 
-    Args:
-        capture: the frames that are fitted.
-        config: settings with all parts.
-        tolerance: as of `leave_out`, like those that follow.
-        seeds: number of seeds.
-        out: folder.
-        progress: of the fits.
-    """
-
-    def __init__(
-        self,
-        capture: Capture,
-        config: StreamConfig,
-        tolerance: float,
-        seeds: int,
-        out: Path,
-        progress: Progress,
-    ) -> None:
-        self._capture = capture
-        self._config = config
-        self._tolerance = tolerance
-        self._seeds = seeds
-        self._out = out
-        self._progress = progress
-        self._arms: list[Arm] = []
-        self._reference = np.zeros(0, int)
-        self._fits = Fits.of(0, seeds)
+    capture: Capture  # the frames that are fitted
+    config: StreamConfig  # settings with all parts
+    tolerance: float  # as of `leave_out`, like those that follow
+    seeds: int
+    out: Path
+    progress: Progress
+    fits: Fits  # those so far
+    arms: list[Arm] = field(default_factory=list)
+    reference: np.ndarray = field(default_factory=partial(np.zeros, 0, int))  # as of `SweepScores`
 
     def compare(self, name: str, ablations: Sequence[Sequence[str]]) -> SweepResult:
         """Fit all parts, under a name, in turn with fits that lack some; return the result so
         far.
         """
-        config = self._config
+        config = self.config
         epochs = config.fit.epochs
         arms = [Arm(name, config, epochs)]
         arms += [Arm(ablation_name(parts), _without(parts, config), epochs) for parts in ablations]
-        self._reference = np.append(self._reference, np.full(len(arms), len(self._arms)))
-        self._arms += arms
-        earlier = self._fits
+        self.reference = np.append(self.reference, np.full(len(arms), len(self.arms)))
+        self.arms += arms
+        earlier = self.fits
 
         def write(later: Fits) -> SweepResult:
-            self._fits = earlier + later
+            self.fits = earlier + later
             return self._write_scores()
 
         # Every round has a bar and a pace of its own.
-        stage = self._progress.of(f"Fitting and evaluating {name}")
-        return write(fit_arms(arms, self._capture, self._seeds, self._out, "psnr", stage, write))
+        stage = self.progress.of(f"Fitting and evaluating {name}")
+        return write(fit_arms(arms, self.capture, self.seeds, self.out, "psnr", stage, write))
 
     def _write_scores(self) -> SweepResult:
         """Write and return the result of the fits so far."""
-        scores = self._fits.scores
-        ratios = excess(scores, self._reference, self._fits.calls, self._tolerance)
-        held_out = bool(self._capture.test_views)
-        name = self._capture.path.name
-        result = SweepResult(name, held_out, self._arms, scores, self._reference, excess=ratios)
+        scores = self.fits.scores
+        ratios = excess(scores, self.reference, self.fits.calls, self.tolerance)
+        held_out = bool(self.capture.test_views)
+        name = self.capture.path.name
+        result = SweepResult(name, held_out, self.arms, scores, self.reference, excess=ratios)
         return self.write(replace(result, tables=leave_out_tables(result)))
 
     def write(self, result: SweepResult) -> SweepResult:
         """Write and return a result of the fits so far."""
-        settings = _reading(self._capture)
-        settings |= {"tolerance": self._tolerance}
-        settings |= {"configs": {"all parts": asdict(self._config)}}
-        return _write_result(result, self._out / "leave-out.json", self._fits, settings)
+        settings = _reading(self.capture)
+        settings |= {"tolerance": self.tolerance}
+        settings |= {"configs": {"all parts": asdict(self.config)}}
+        return _write_result(result, self.out / "leave-out.json", self.fits, settings)
 
 
 def _without(parts: Sequence[str], config: StreamConfig) -> StreamConfig:
