@@ -67,20 +67,14 @@ class PathTracer:
             ValueError: Mitsuba cannot load it.
         """
         self.scene = scene
-        content: SceneDict = {
-            "type": "scene",
-            **{name: light.shape for name, light in scene.lights.items()},
-        }
+        content: SceneDict = {"type": "scene"}
+        for name, light in scene.lights.items():
+            content |= light.entries(name)
         owners: dict[str, int] = {}  # the index of the object of each shape
         for index, (name, item) in enumerate(scene.objects.items()):
-            if item.pose is None:
-                shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
-            else:  # one instance of a group
-                content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
-                reference = {"type": "ref", "id": f"{name}_group"}
-                shapes = {name: {"type": "instance", "group": reference}}
-            content |= shapes
-            owners |= dict.fromkeys(shapes, index)
+            entries = item.entries(name)
+            content |= entries
+            owners |= dict.fromkeys(entries, index)
         try:
             # The optimisation would merge meshes that share a material, even meshes of different
             # objects.

@@ -33,6 +33,18 @@ class Object:
     #: Seconds -> rigid object-to-world matrix [4, 4]; None for a static object, in world space.
     pose: Pose | None = None
 
+    def entries(self, name: str) -> SceneDict:
+        """Return its entries in a Mitsuba scene by their ids; one that moves is an instance of a
+        group.
+        """
+        if self.pose is None:
+            return {f"{name}_{part}": shape for part, shape in self.shapes.items()}
+        group = f"{name}_group"
+        return {
+            group: {"type": "shapegroup", **self.shapes},
+            name: {"type": "instance", "group": {"type": "ref", "id": group}},
+        }
+
 
 @dataclass(frozen=True)
 class Light:
@@ -42,6 +54,10 @@ class Light:
     shape: SceneDict
     #: Seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
     pose: Pose | None = None
+
+    def entries(self, name: str) -> SceneDict:
+        """Return its entry in a Mitsuba scene by its id."""
+        return {name: self.shape}
 
 
 @dataclass(frozen=True)
@@ -139,24 +155,17 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
         for name, item in items.items():
             where = f"scene {scene.name!r}, {kind} {name!r}"
             check_type(where, "it", item, expected, f"see {page('scenes')}")
-            # The names in Mitsuba.
-            if isinstance(item, Light):
-                ids = [name]
-                _check_values(where, {"shape": item.shape})
-            else:
-                ids = [f"{name}_{part}" for part in item.shapes]
-                if item.pose is not None:
-                    ids = [name, f"{name}_group"]
-                _check_values(where, item.shapes)
-            twice = names & {*ids}
+            entries = item.entries(name)
+            _check_values(where, entries)
+            twice = sorted(names & entries.keys())
             require(
                 not twice,
                 where,
                 "its names in Mitsuba must be its own",
-                f"{sorted(twice)} twice",
+                f"{twice} twice",
                 "rename one",
             )
-            names.update(ids)
+            names |= entries.keys()
             pose: Any = item.pose
             for time in times if pose else ():
                 pose_place = f"{where}: its pose at {time:.4g} s"

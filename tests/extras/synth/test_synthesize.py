@@ -152,7 +152,7 @@ WRONG_SCENES = {
     "none": (
         {"a": Object({"b": sphere(radius=None)})},
         {},
-        "object 'a', b: `radius` must have a value, got None",
+        "object 'a', a_b: `radius` must have a value, got None",
     ),
     "no object": (
         {"a": sphere()},
