@@ -183,14 +183,15 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     Raises:
         ValueError: an entry is missing, or has another type or range than it must have.
     """
-    name, *rows, width, height, near = _entries(fields, _CAMERA, f"{where}.")
-    K, viewmat = (numbers(where, "matrix", matrix) for matrix in rows)
+    name, K_rows, viewmat_rows, width, height, near = _entries(fields, _CAMERA, f"{where}.")
+    K = numbers(where, "matrix", K_rows)
+    viewmat = numbers(where, "matrix", viewmat_rows)
     is_view = (K.shape, viewmat.shape) == ((3, 3), (4, 4)) and bounded(K) and bounded(viewmat)
     if not is_view or not name.isprintable() or width * height > _MAX_PIXELS:
         raise ValueError(
             f"`{where}` must have a printable `name`, at most 2^26 pixels, and `K` [3][3] and "
             f"`viewmat` [4][4] of at most {LARGEST:g}, got {name!r:.60}, {width}x{height}, "
-            f"{rows!s:.200}"
+            f"{[K_rows, viewmat_rows]!s:.200}"
         )
     background = fields.get("background")
     if background is not None:

@@ -60,7 +60,9 @@ class ComparedClip:
             packets.setdefault(packet.frame, (packet.kind, packet.num_bytes))
         recording = open_stream_capture(stream, capture, list(packets), any_recording)
         views = recording.test_views or recording.train_views
-        channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
+        channels = ("color", "motion")
+        if has_confidence(stream):
+            channels = (*channels, "confidence")
         cameras = recording.with_delays(stream.cameras)
         return cls(
             stream,

@@ -120,7 +120,7 @@ def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
             f"delta_e_map(): images must be [H, W, 3], got {np.shape(image)}; give them three "
             "channels."
         )
-    a, b = (np.clip(each, 0, 1) for each in unit_pair("delta_e_map", image, truth))
+    a, b = np.clip(unit_pair("delta_e_map", image, truth), 0, 1)
 
     def lab(colours: np.ndarray) -> np.ndarray:
         xyz = decode_light(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T

@@ -12,7 +12,6 @@ import numpy as np
 from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.types import Float, Jit
-from morgs_mi.render.backend import elements
 from morgs_mi.render.render_config import RenderConfig
 
 
@@ -38,10 +37,10 @@ def over(background: Sequence[float] | Jit | None, values: Float, weight: Float)
     if dr.width(behind) == dr.width(values):
         return dr.fma(1 - weight, behind, values)
     # Numbers of their own: the gradient of one array would be added by all pixels to three places.
-    red, green, blue = (elements(behind, mi.UInt32(k)) for k in range(3))
+    one = dr.gather(mi.Color3f, behind, mi.UInt32(0))
     component = dr.arange(mi.UInt32, dr.width(weight)) % 3
     return dr.fma(
         1 - weight,
-        dr.select(component == 0, red, dr.select(component == 1, green, blue)),
+        dr.select(component == 0, one.x, dr.select(component == 1, one.y, one.z)),
         values,
     )

@@ -84,7 +84,8 @@ class Layout:
     @property
     def sizes(self) -> tuple[int, ...]:
         """Floats per pixel of every output, alpha last."""
-        return (*(channel.size for channel in self.channels), *((1,) if self.alpha else ()))
+        sizes = tuple(channel.size for channel in self.channels)
+        return (*sizes, 1) if self.alpha else sizes
 
 
 def record_packets(layout: Layout) -> int:
@@ -116,7 +117,8 @@ class _Block:
         self.rows = of_lane(lists.rows)
         self.pitch = elements(lists.pitch, mi.UInt32(0))
         # Centre of the first pixel.
-        self.x, self.y = (mi.Float(of_lane(v)) + 0.5 for v in (lists.x, lists.y))
+        self.x = mi.Float(of_lane(lists.x)) + 0.5
+        self.y = mi.Float(of_lane(lists.y)) + 0.5
         begin = of_lane(lists.begin)
         first = of_lane(lists.first)
         # One depth limit per pixel, row by row; none without depth limits.
@@ -434,7 +436,8 @@ def tangent(layout: Layout, lists: BlockLists, tangents: Float, images: list[Flo
 
     def body(walk, T, dT, dsums):
         depth_order, walk = block.advance(walk)
-        record, tangent = (fetch_record(r, depth_order, G + C) for r in (lists.records, tangents))
+        record = fetch_record(lists.records, depth_order, G + C)
+        tangent = fetch_record(tangents, depth_order, G + C)
         with dr.resume_grad():
             inputs = [mi.Float(v) for v in (*record, *T)]
             dr.enable_grad(inputs)

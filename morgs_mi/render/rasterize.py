@@ -305,7 +305,7 @@ def draw(
         lists = build_lists(drawn, columns, region, output.config, limits)
     sizes = {**{name: len(splats.channels[name]) for name in blended}, "alpha": 1}
     # Divided by the sum of the weights, or composited by it over the background.
-    weighted = [*NORMALISED, *(["color"] if background is not None else [])]
+    weighted = NORMALISED if background is None else (*NORMALISED, "color")
     read_alpha = [name for name in output.channels if name in ("alpha", *weighted)]
     layout = Layout(
         tuple(Channel(sizes[name], name not in output.detach_weights) for name in blended),
@@ -376,7 +376,8 @@ def _nothing(
 
 def _all_channels(channels: Sequence[str], features: Tensor | None) -> tuple[str, ...]:
     """Return the channels of an image, with that of the features if there are any."""
-    return (*dict.fromkeys(channels), *(() if features is None else ("features",)))
+    names = tuple(dict.fromkeys(channels))
+    return names if features is None else (*names, "features")
 
 
 # ---- checks of the arguments

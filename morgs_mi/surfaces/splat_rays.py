@@ -162,8 +162,11 @@ class SplatRays:
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
         require_some("SplatRays()", gaussians, "pass some")
         self._config = config_or_default("SplatRays()", config, RenderConfig())
-        names = ("means", "scales", "quats", "opacities", "sh_coeffs")
-        means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)
+        means = _finite(gaussians, "means")
+        scales = _finite(gaussians, "scales")
+        quats = _finite(gaussians, "quats")
+        opacities = _finite(gaussians, "opacities")
+        coeffs = _finite(gaussians, "sh_coeffs")
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
         # A quaternion of length 0 is the identity.
         quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])

@@ -397,7 +397,7 @@ def _rays(sensor: Any, pixel: UInt32, offset: Vector2f) -> mi.Ray3f:
     """Return rays through the positions `offset` [0, 1]^2 of pixels of a sensor's film, numbered
     row by row.
     """
-    width, height = (dr.opaque(mi.UInt32, int(size)) for size in sensor.film().crop_size())
-    row = pixel // width
-    position = (mi.Vector2f(pixel - row * width, row) + offset) / mi.Vector2f(width, height)
+    size: Any = dr.opaque(mi.Vector2u, list(sensor.film().crop_size()))
+    row = pixel // size.x
+    position = (mi.Vector2f(pixel - row * size.x, row) + offset) / mi.Vector2f(size)
     return sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]

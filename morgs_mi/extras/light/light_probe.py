@@ -91,8 +91,9 @@ def light_probe(
         # What other faces show may be behind this camera.
         seen_directions = np.where(on_face, directions, camera.rotation[2])
         pixels, _ = camera.project(camera.position + seen_directions)
-        x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
-        color = np.where(on_face, cv2.remap(image, x, y, cv2.INTER_LINEAR), color)
+        places = pixels.astype(np.float32) - 0.5
+        face = cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
+        color = np.where(on_face, face, color)
     light = radiance(dr.unravel(mi.Color3f, from_numpy(mi.Float, color)), clipped)
     return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light).T.reshape(directions.shape))}
 

@@ -166,17 +166,20 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
                 "rename one",
             )
             names |= entries.keys()
-            pose: Any = item.pose
-            for time in times if pose else ():
-                pose_place = f"{where}: its pose at {time:.4g} s"
-                try:
-                    matrix = np.reshape(pose(time), (4, 4))
-                except Exception as error:
-                    reason = f"{type(error).__name__}: {error}".rstrip(".")
-                    raise ValueError(
-                        f"{pose_place} fails with {reason}; correct the function."
-                    ) from error
-                rigid(f"{pose_place} is not rigid", matrix)
+            if item.pose is not None:
+                _check_pose(f"{where}: its pose", item.pose, times)
+
+
+def _check_pose(place: str, pose: Pose, times: Sequence[float]) -> None:
+    """Raise `ValueError` if a pose fails, or is not rigid, at one of some times in seconds."""
+    for time in times:
+        at = f"{place} at {time:.4g} s"
+        try:
+            matrix = np.reshape(pose(time), (4, 4))
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".rstrip(".")
+            raise ValueError(f"{at} fails with {reason}; correct the function.") from error
+        rigid(f"{at} is not rigid", matrix)
 
 
 def _check_values(where: str, node: Mapping[str, Any]) -> None:
