@@ -102,19 +102,13 @@ def run_demo(
     with locked_folder(root, "run_demo()"):
         capture = root / "capture"
         run_step("Path-tracing the clip", partial(_synthesize_clip, capture, config))
-        run_step(
-            "Fitting",
-            lambda progress: _fit(load_capture(capture), root / "stream", config.stream, progress),
-        )
+        run_step("Fitting", partial(_fit, load_capture(capture), root / "stream", config.stream))
         run_step("Fitting without ML, MO, MC", partial(_fit_plain, root, config))
         results = {
-            name: run_step(
-                f"Evaluating {folder}",
-                lambda progress, folder=folder: evaluate_stream(root / folder, progress=progress),
-            )
+            name: run_step(f"Evaluating {folder}", partial(evaluate_stream, root / folder, None))
             for name, folder in (("full", "stream"), ("plain", "stream_plain"))
         }
-        run_step("Drawing", lambda report: _draw(root, load_capture(capture), report))
+        run_step("Drawing", partial(_draw, root, load_capture(capture)))
         # The frames that both fits have, without the first, which has no motion.
         count = min(result.num_frames for result in results.values())
         frames = [row.frame for row in results["full"].frames[1:count]]
