@@ -233,8 +233,6 @@ def render_view(
     if depth_limit is not None:
         limits = _depth_limits(place, depth_limit, view)
         projected = (*projected, "profile")
-    if means2d is not None:
-        _check_means2d(place, means2d, gaussians, view, depth_limit)
     if not int(gaussians.means.shape[0]):
         return _nothing(output, table, region, background)
     rows = None
@@ -249,11 +247,12 @@ def render_view(
         if not dr.width(rows):
             return _nothing(output, table, region, background)
     splats = project(gaussians, camera, projected, view.config, rows, table)
-    absolute: Sequence[Float] = ()
+    absolute: tuple[Float, ...] = ()
     if means2d is not None:
-        lane = dr.arange(mi.UInt32, len(splats)) * 4
-        x, y, *absolute = (dr.gather(mi.Float, means2d.array, lane + k) for k in range(4))
-        splats = replace(splats, mean=splats.mean + mi.Point2f(x, y))
+        _check_means2d(place, means2d, gaussians, view, depth_limit)
+        probe: Any = dr.gather(mi.Vector4f, means2d.array, dr.arange(mi.UInt32, len(splats)))
+        absolute = (probe.z, probe.w)
+        splats = replace(splats, mean=splats.mean + probe.xy)
     dr.schedule(splats)
     _check_finite(splats.finite, gaussians, [camera], table)
     static = view.static_splats
@@ -261,7 +260,7 @@ def render_view(
     if static is not None:  # these get no gradients
         with dr.suspend_grad():
             drawn = splats.concatenated_with(static.alone)
-    return draw(output, splats, drawn, region, background, limits, tuple(absolute))[0]
+    return draw(output, splats, drawn, region, background, limits, absolute)[0]
 
 
 @dataclass(frozen=True)
