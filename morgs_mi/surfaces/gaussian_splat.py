@@ -244,6 +244,12 @@ def _sensor_camera(sensor: mi.Sensor, border: int) -> Camera:
     return AttachedCamera(K, viewmat, *size, view.name, view.near, focal=focal, center=center)
 
 
+def _side_by_side(stack: Tensor) -> Tensor:
+    """Return images [V, H, W, C] as one [H, V W, C]."""
+    V, H, W, C = stack.shape
+    return dr.reshape(dr.moveaxis(stack, 0, 1), (H, V * W, C))
+
+
 def _sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
     """Return a sensor, which may be given by its number in the scene."""
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -486,10 +492,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         image = rasterize(gaussians, camera, channels, self.background, config=self.config)
         images: dict[str, Tensor] = {name: image[name] for name in channels}
         if len(cameras) > 1:
-            count = range(len(cameras))
-            images = {
-                name: dr.concat([stack[v] for v in count], axis=1) for name, stack in images.items()
-            }
+            images = {name: _side_by_side(stack) for name, stack in images.items()}
         columns = {name: cropped(value, crop) for name, value in images.items()}
         if self.srgb_primitives:
             columns["color"] = [decode_traced(value) for value in columns["color"]]

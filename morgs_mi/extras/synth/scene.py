@@ -124,13 +124,13 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     # The package's scenes, from the repository or from the installed data files.
     checkout = Path(__file__).parents[3] / "scenes"
     if checkout.is_dir():
-        files = {path.stem: path for path in checkout.glob("*.py")}
+        paths = checkout.glob("*.py")
     else:
         installed = metadata.files("morgs-mi") or []
         paths = (Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py"))
-        files = {path.stem: path for path in paths}
-    path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
-    if path is None or not path.is_file():
+    files = {path.stem: path for path in paths}
+    path = files.get(str(scene), Path(scene))
+    if path.suffix != ".py" or not path.is_file():
         raise ValueError(
             f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)}, or a .py file."
         )
