@@ -406,8 +406,8 @@ def test_first_frame_config__is_shared_by_the_presets_and_parts_of_later_frames(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--seeds", 0), "seeds must be at least 1, got 0"),
-        (("--frames", 1), "frames must be at least 2, got 1"),
+        (("--seeds", 0), "`seeds` must be at least 1, got 0"),
+        (("--frames", 1), "`frames` must be at least 2, got 1"),
     ],
 )
 def test_sweep__refuses_numbers_on_the_command_line(tmp_path, run, options, message):
