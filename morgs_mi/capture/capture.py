@@ -290,6 +290,7 @@ class Capture:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """
+        stop = self.num_frames if stop is None else min(stop, self.num_frames)
         return self.views[view].images(start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -304,7 +305,7 @@ class Capture:
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
-        streams = [view.images(start, stop) for view in self.views]
+        streams = [self.images(view, start, stop) for view in range(len(self.views))]
         frame = None
         try:
             for index, images in enumerate(zip(*streams, strict=True), start=start):

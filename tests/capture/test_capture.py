@@ -62,6 +62,12 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path, d
         assert_close(shown_dot(image), camera.project(point)[0], atol=0.1)
 
 
+def test_frames__ends_with_the_last_frame_of_the_capture(tmp_path):
+    capture = replace(load_capture(layouts.n3dv(tmp_path / "a")), num_frames=2)
+    assert [frame.index for frame in capture.frames()] == [0, 1]
+    assert len(list(capture.images(0, 1, 9))) == 1
+
+
 def test_load_capture__prefers_lossless_frames(tmp_path):
     path = layouts.n3dv(tmp_path / "a")
     write_video(path / "frames" / "cam02", frames(77), FPS)
