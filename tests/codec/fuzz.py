@@ -1,8 +1,8 @@
-"""Program that reads damaged and forged streams until a time is over, with little memory and little
-time for each.
+"""Program that reads a number of damaged and forged streams, or until a time is over, with little
+memory and little time for each.
 
-`python -m tests.codec.fuzz SECONDS [FUZZER ...]` prints the number of streams as JSON. It needs a
-process of its own: a limit on the address space may end any thread of any
+`python -m tests.codec.fuzz CASES SECONDS [FUZZER ...]` prints the number of streams as JSON; CASES
+may be inf. It needs a process of its own: a limit on the address space may end any thread of any
 library, at once and without an exception (glibc exits with status 127 where it has no memory for
 the thread-local data of a library).
 """
@@ -41,7 +41,7 @@ THREAD_BYTES = 72 * 2**20
 THREADS = 4
 CASE_SECONDS = 30
 PLACE = re.compile(
-    r"packet \d+ at byte \d+: |expected a stream that starts with|`.*` of "
+    r"packet \d+ at byte \d+: |packet 0: metadata: `|expected a stream that starts with|`.*` of "
     r"the header|expected the path of its capture"
 )
 
@@ -209,8 +209,8 @@ def limit_memory():
     resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
 
 
-def run(name, clip, seconds):
-    """Run a fuzzer and return its number of streams.
+def run(name, clip, cases, seconds):
+    """Run a fuzzer for a number of cases, at most some seconds, and return its number of streams.
 
     Raises:
         AssertionError: a case fails; its seed is the name of the fuzzer and the number of the case.
@@ -219,7 +219,7 @@ def run(name, clip, seconds):
     end = time.monotonic() + seconds
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "s"
-        while time.monotonic() < end:
+        while case < cases and time.monotonic() < end:
             faulthandler.dump_traceback_later(CASE_SECONDS, exit=True)
             try:
                 FUZZERS[name](clip, path, np.random.default_rng([case, *name.encode()]))
@@ -232,8 +232,8 @@ def run(name, clip, seconds):
     return {"streams": case}
 
 
-def main(seconds, *names):
-    """Run fuzzers for some seconds each and print the results."""
+def main(cases, seconds, *names):
+    """Run fuzzers for a number of cases, at most some seconds each, and print the results."""
     mi.set_variant("llvm_ad_rgb")
     faulthandler.enable()
     clip = short_clip()
@@ -243,7 +243,7 @@ def main(seconds, *names):
         check_readers(Path(folder) / "s")
     limit_memory()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    results = {name: run(name, clip, float(seconds)) for name in names or FUZZERS}
+    results = {name: run(name, clip, float(cases), float(seconds)) for name in names or FUZZERS}
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory)
     print(
         json.dumps({"seconds": float(seconds), "memory_bytes": grown, "fuzzers": results}, indent=1)
