@@ -3,10 +3,10 @@
     python -m benchmarks.reports.starts --json out.json
 
 Mitsuba traces the scenes, and `fit_gaussians` gets the images with their sensors alone. The start
-"each view" is what it had before, given as points: random ones in every view, at depths from a
-third to three times that of the focus point. "random" starts from random points at the depths at
-which most views agree. So does "found", except on `room` and `hall`, where few cameras are far
-apart. Settings were chosen on `ring` and `dome`, those of few far cameras on walk4 and `room`.
+"each view" gives it random points in every view, at 0.33 to 3 times the depth of the focus point.
+"random" starts from random points at the depths at which most views agree. So does "found", except
+on `room` and `hall`, where few cameras are far apart. Settings of this start were chosen on walk4
+and `room`, all others on `ring` and `dome`.
 """
 
 from __future__ import annotations

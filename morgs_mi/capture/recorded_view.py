@@ -1,5 +1,5 @@
-"""A view of a recording: a camera with its clip, whose images are converted to those of a pinhole
-camera on the common timeline.
+"""A view of a recording: a camera with its clip. Images of the clip are undistorted, so that a
+pinhole camera shows them, and are read at the timestamps that all clips share.
 """
 
 from __future__ import annotations

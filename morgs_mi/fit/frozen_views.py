@@ -69,7 +69,7 @@ class LaterLosses:
     motion: MotionConfig  #: Gates of the residual.
     render: RenderConfig  #: Cut-offs.
     num_static: int  #: Static splats that it has room for.
-    static_size: int  #: Size of the arrays that have those of all views.
+    static_size: int  #: Size of the arrays that hold the static splats of all views.
 
     def __call__(
         self,
@@ -112,7 +112,7 @@ class LaterLosses:
         count = elements(view["static_range"], mi.UInt32(1))
         with dr.suspend_grad():
             drawn = splats.followed_by(static, first, count, self.num_static)
-        image, lists = draw(output, splats, drawn, region)
+        image, lists = draw(output, splats, drawn, region, view.get("background"))
         prediction = Prediction(
             image,
             parameters,
@@ -154,7 +154,7 @@ class FirstLosses:
         dr.schedule(splats)
         region = PaddedRegion(sizes, words)
         output = Output(("color",), (), self.render, region.shape(0)[:-1])
-        image, lists = draw(output, splats, splats, region)
+        image, lists = draw(output, splats, splats, region, view.get("background"))
         target = _comparison(region, words, view)
         loss = recon_loss(image.color, target, self.dssim_weight)
         return Losses({"recon": loss, SQUARED_ERROR: target.mse}, lists.total)
@@ -181,13 +181,15 @@ class ComparedView:
     camera: Camera  #: The view.
     region: Region  #: The blocks that are drawn.
     on: Comparison  #: The target there.
+    #: Encoded colour [3] behind all Gaussians; None: black.
+    background: tuple[float, float, float] | None
 
     @classmethod
     def of(cls, view: ObservedView) -> ComparedView:
         """Return an active view, or a whole one, with its image."""
         region = view.region or full_view(*view.grid.size, view.grid.block, 1, mi.variant())
         on = view.target.comparison(None if region.whole else region)
-        return cls(view.camera, region, on)
+        return cls(view.camera, region, on, view.config.background)
 
 
 class Rooms:
@@ -207,7 +209,9 @@ class Rooms:
             name: room_for(name, max(len(view.on.runs[name]["end"]) for view in views))
             for name in views[0].on.runs
         }
-        self._is_partial = any(region.weights is not None for region in regions)
+        # Blocks that fill up a region lie outside the view, where a background must not be seen.
+        has_background = any(view.background is not None for view in views)
+        self._is_partial = has_background or any(region.weights is not None for region in regions)
 
     def sizes(self, region: Region) -> PaddedSizes:
         """Return the sizes of a view's region, without a capacity."""
@@ -234,6 +238,8 @@ class Rooms:
         packing, words = packed(numbers)
         arrays = {"words": words, "pose": from_numpy(mi.Float64, camera.viewmat[:3].ravel())}
         arrays |= {name: getattr(on, name) for name in ("pixels", "mean", "variance")}
+        if view.background is not None:
+            arrays["background"] = from_numpy(mi.Float, np.array(view.background, np.float32))
         return packing, arrays if on.weight is None else {**arrays, "weight": on.weight}
 
 
@@ -380,7 +386,6 @@ def _is_plain(view: ActiveView) -> bool:
     return (
         not (camera.delay or camera.readout)
         and camera.backdrop is None
-        and view.config.background is None
         and not dr.is_array_v(camera.viewmat)
         # The blocks that fill up a region change its sections in several launches.
         and (view.region is None or sections(2 * view.region.num_blocks)[0] == 1)
@@ -393,8 +398,8 @@ def _row_shape(name: str, width: int) -> tuple[int, ...]:
 
 
 def _columns(splats: Splats, size: int) -> dict[str, Any]:
-    """Return splats as arguments of a recording, in arrays of a size: Dr.Jit infers the sizes of
-    launches from those of arrays, and would take other ones for others.
+    """Return splats as arguments of a recording, in arrays of a fixed size: Dr.Jit infers the size
+    of a launch from the sizes of its arrays.
     """
     names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid", "channels")
     lane = dr.arange(mi.UInt32, size)

@@ -38,13 +38,14 @@ MOTION = MotionConfig()
 EXTENT = 3.0
 
 
-def moving_ball(static_count=250, grown=0):
+def moving_ball(static_count=250, grown=0, render=RENDER):
     """Return the problem of a frame in four views of two sizes, with regions of four sizes: one of
     them a key view with a mask of its pixels.
 
     Args:
         static_count: number of Gaussians that are not active, of 400.
         grown: pixels by which the regions are larger.
+        render: cut-offs, and the colour behind all Gaussians.
     """
     previous = at_rest(replace(opaque_ball(), logit_confidence=np.zeros(400)))
     active_rows = np.arange(static_count, 400)
@@ -66,7 +67,7 @@ def moving_ball(static_count=250, grown=0):
             channels = ("color", "guided_motion", "confidence")
             mask = rng.random(drawn.shape) < 0.9
         static = previous.select(np.arange(static_count))
-        view = make_active_view(camera, Region.of(drawn, RENDER), static, channels, RENDER)
+        view = make_active_view(camera, Region.of(drawn, render), static, channels, render)
         views[v] = ObservedView.of(view, Target(image, mask), observations)
     active = ActiveSet(active_rows, 400, views, 4)
     return FrameProblem(previous, active, views, None, EXTENT)
@@ -86,13 +87,16 @@ def without_recordings(function):
         return function()
 
 
-def test_fit_later_frame__has_the_same_bits_as_by_plain_steps():
+@pytest.mark.parametrize("background", [None, (0.1, 0.7, 0.4)])
+def test_fit_later_frame__has_the_same_bits_as_by_plain_steps(background):
     """40 steps and a round of births, whose scores some of them take."""
+    render = RenderConfig(background=background)
     density = DensityConfig(later_frames=True, births=0.1, min_error=0)
     config = FitConfig(sh_degree=0, epochs=10, density=density)
 
     def fit():
-        return fit_later_frame(moving_ball(), config, MOTION, np.random.default_rng(0))
+        frame = moving_ball(render=render)
+        return fit_later_frame(frame, config, MOTION, np.random.default_rng(0))
 
     recorded = fit()
     expected = without_recordings(fit)
@@ -147,8 +151,10 @@ def test_fit_later_frame__has_the_same_bits_if_all_gaussians_are_active():
     assert raw(fit()) == raw(without_recordings(fit))
 
 
-@pytest.mark.parametrize("dropout", [0.0, 0.3])
-def test_fit_first_frame__has_the_same_bits_as_by_plain_steps(dropout):
+@pytest.mark.parametrize(
+    ("dropout", "background"), [(0.0, None), (0.3, None), (0.0, (0.1, 0.7, 0.4))]
+)
+def test_fit_first_frame__has_the_same_bits_as_by_plain_steps(dropout, background):
     """A band, rounds of density control, and a masked view."""
     images = bytes_of(images_of(opaque_ball()))
     masks = [None, np.indices(images[1].shape[:2])[0] > 4, None, None]
@@ -158,7 +164,8 @@ def test_fit_first_frame__has_the_same_bits_as_by_plain_steps(dropout):
     )
 
     def fit():
-        frame = problem(images, ball(80, sh_degree=1), masks)
+        render = RenderConfig(background=background)
+        frame = problem(images, ball(80, sh_degree=1), masks, render)
         return first_frame.fit_first_frame(frame, config, np.random.default_rng(0))
 
     assert raw(fit()) == raw(without_recordings(fit))

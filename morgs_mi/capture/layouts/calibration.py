@@ -39,7 +39,7 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 @dataclass(frozen=True)
 class CalibratedImage:
-    """One image of a calibration; those of one clip have the same pose and lens."""
+    """One image of a calibration. All images of a clip have the same pose and lens."""
 
     camera: Camera  #: The camera, with the name of the image.
     #: The lens that the image was recorded through.
@@ -55,7 +55,7 @@ class CalibratedImage:
 
     @property
     def pose(self) -> Hashable:
-        """The exact pose, intrinsics and lens, to compare with those of another image."""
+        """The exact pose, intrinsics and lens. They are equal for images of one fixed camera."""
         camera = self.camera
         return camera.world_to_camera.tobytes(), camera.K.tobytes(), camera.size, self.lens
 
