@@ -175,7 +175,7 @@ def test_push__replaces_too_few_points_and_reports_it(clip, monkeypatch):
     nothing = np.zeros((0, 3))
     loop = StreamLoop(cameras()[:4], nothing, nothing, with_fit(density=DensityConfig()))
     _, report = loop.push(clip[0][:4])
-    assert "too few points (0): 300 others" in report.status
+    assert "too few points (0): 300 more were initialised from" in report.status
     assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 

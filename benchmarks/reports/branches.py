@@ -204,7 +204,7 @@ BRANCHES: tuple[Branch, ...] = (
             )
         },
     ),
-    Branch(_ACTIVE, "hidden Gaussians", {"method.active_set:_MIN_WEIGHT": 0.0}),
+    Branch(_ACTIVE, "hidden Gaussians", {"method.active_set:MIN_WEIGHT": 0.0}),
     Branch(_ACTIVE, "overlap", {"method.active_set:_MIN_OVERLAP": -1.0}),
     Branch(
         _ACTIVE,

@@ -313,7 +313,7 @@ class Capture:
                 if strict and errors:
                     raise errors[0]
                 frame = PartialFrame.of(index, self.views, images, frame)
-                if index == 0:
+                if index == 0 and any(view.times.delay for view in self.views):
                     # The motion in the first frame is unknown, so delays cannot be rendered.
                     first = map(RecordedView.at_first_timestamp, self.views, frame.views)
                     frame = replace(frame, views=Views(first), recorded=frame.views)

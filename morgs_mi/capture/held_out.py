@@ -37,7 +37,7 @@ def held_out_by(
     """
     if requested != "auto":
         return held_out_views(path, requested, subset.names)
-    if setting is None:
+    if setting in (None, ()):
         return ()
     names = every.held_out or ()
     if setting != "auto":

@@ -61,8 +61,9 @@ def used_in_clip(
     if opaque is not None:
         used_mask &= opaque
     if not used_mask.any():
+        place = few(files, 3) if files else reader.path
         raise ValueError(
-            f"{reader.path}: expected pixels of {name} that are used, got all black in a mask or "
+            f"{place}: expected pixels of {name} that are used, got all black in a mask or "
             "transparent; correct the mask."
         )
     return None if used_mask.all() else used_mask, notes

@@ -81,8 +81,8 @@ class RecordedView(View):
         return self.with_camera(self.camera.resized(*self.recorded_size))
 
     def refined(self, camera: Camera, k1: float, k2: float) -> RecordedView:
-        """Return the view with a refined camera, and images without the radial terms of the
-        distortion left in them.
+        """Return the view with a refined camera, and images from which the radial distortion k1, k2
+        is removed.
         """
         if not (k1 or k2):
             return replace(self, camera=camera)

@@ -91,7 +91,9 @@ class _Clock:
     length: int  # number of positions that the clip covers
     offset: float
     rate: float
-    is_shifted: bool  # whether its offset is not whole
+    # Whether its frames show the timestamps with a constant delay: its offset is not whole, its
+    # rate is constant, and it has several frames.
+    is_shifted: bool
 
     def timestamp(self, positions: np.ndarray | int) -> np.ndarray:
         """Return the timestamps [...] at positions [...] of the clip."""
@@ -207,9 +209,10 @@ def _by_numbers(
     """Return the clocks of clips by the numbers of their images, too, the number of timestamps per
     second, and a sentence for each assumption.
     """
-    folders = {name: clock.reader.numbers or () for name, clock in clocks.items()}
-    numbers = {name: clip for name, clip in folders.items() if len(clip) > 1}
-    if len({(clip[0], clip.step) for clip in numbers.values()}) < 2:
+    folders = {name: clock.reader.numbers for name, clock in clocks.items()}
+    numbers = {name: clip for name, clip in folders.items() if clip}
+    is_clip = any(len(clip) > 1 for clip in numbers.values())
+    if not is_clip or len({(clip[0], clip.step) for clip in numbers.values()}) < 2:
         return clocks, fps, []
     table = ", ".join(f"{name} {_range(clip)}" for name, clip in numbers.items())
     if config.offset and not config.trim:
@@ -270,7 +273,9 @@ def _time_codes(readers: Mapping[str, FrameReader]) -> list[str]:
 
 
 def _variable_rate(positions: np.ndarray, fps: float, frame_indices: np.ndarray) -> str:
-    """Return how irregular the frames of a clip at some positions are, and which are shown [T]."""
+    """Return a sentence on the spacing of a clip's frames, and on how many of the T timestamps
+    repeat a frame or have none.
+    """
     period = 1e3 / fps
     late = np.abs(positions - np.rint(positions)).max() * period
     frames = frame_indices[frame_indices >= 0]

@@ -39,7 +39,7 @@ from morgs_mi.render.render_config import RenderConfig
 
 ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs")
 """Attributes on which the colour depends."""
-# What has an error: the image, and the gradient of each attribute.
+# Results whose errors are measured: the image, and the gradient of each attribute.
 _COMPARED: tuple[str, ...] = ("image", *ATTRIBUTES)
 # Those whose gradients may almost vanish: their errors are relative to the largest of the three.
 _SHAPE = np.isin(_COMPARED, ("log_scales", "quats", "logit_opacities"))

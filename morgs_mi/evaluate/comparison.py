@@ -23,8 +23,6 @@ from morgs_mi.playback.stream_header import open_stream_capture, render_config, 
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.render_config import RenderConfig
 
-_NO_VIEW = -1
-
 
 @dataclass(frozen=True, eq=False)
 class ComparedClip:
@@ -128,7 +126,8 @@ class ComparedFrame:
                 last_image = self.last.get(index)
                 if last_image is not None and clip.recording.truth is None:
                     moving = recorded_change(last_image, image)
-                copy = self.images.get(clip.nearest.get(index, _NO_VIEW))
+                nearest = clip.nearest.get(index)
+                copy = None if nearest is None else self.images.get(nearest)
                 light = None if clip.recording.display_exposure is None else self.recorded[index]
                 valid = clip.recording.masks[index]
                 yield ComparedView(self, index, maps, image, valid, moving, truth, light, copy)

@@ -36,7 +36,7 @@ _FALSE_ALARMS = 0.02
 
 
 class _FitReport(NamedTuple):
-    """What the report of a fit has on a frame."""
+    """Entry of a frame in the report of a fit."""
 
     seconds: float | None = None  # wall time
     num_missing: int = 0  # views without an image
@@ -139,7 +139,7 @@ def evaluate_stream(
 
 
 def _fitted(stream: Path) -> dict[int, _FitReport]:
-    """Return what the report beside the stream has on each frame; empty without one."""
+    """Return the entries of the report beside the stream, by frame; none without a report."""
     path = stream.with_name(REPORT)
     if not path.is_file():
         return {}

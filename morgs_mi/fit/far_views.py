@@ -162,7 +162,7 @@ def far_points(views: Sequence[View], count: int, rng: np.random.Generator) -> P
 
 
 def concatenated_points(parts: Sequence[Points]) -> Points:
-    """Return points one after the other."""
+    """Return several sets of points as one: positions [P, 3] and colours [P, 3]."""
     positions, colors = zip(*parts, strict=True)
     return np.concatenate(positions), np.concatenate(colors)
 

@@ -195,7 +195,7 @@ def fit_first_frame(
     bands = [int(k * steps * BAND + 1e-9) for k in range(1, problem.start.sh_degree + 1)]
     rounds = density_rounds(config)
     fit = _GaussianFit(problem, config, rng)
-    fit.use(half_sized(problem.views) if rounds else problem.views)
+    fit.set_views(half_sized(problem.views) if rounds else problem.views)
     order = iter(view_order(len(fit.views), steps, rng))
     pace = _Pace(steps, limit, _LATE if rounds else 1.0)
     losses = {}
@@ -206,9 +206,9 @@ def fit_first_frame(
             fit.add_band()
         if first in rounds:
             if first == rounds[-1]:  # its scores come from the full images already
-                fit.use(problem.views)
+                fit.set_views(problem.views)
             fit.density_round(len(rounds) - rounds.index(first))
-        losses = fit.make(
+        losses = fit.run(
             Steps(
                 pace.views(order, stop),
                 rate_factor=lambda _: FINAL_RATE ** (pace.position / steps),
@@ -225,7 +225,7 @@ def fit_first_frame(
 
 
 class _GaussianFit:
-    """Fit of the Gaussians of the first frame, in parts; `use` comes first.
+    """Fit of the Gaussians of the first frame, in parts; `set_views` comes first.
 
     Args:
         problem: initial Gaussians, cameras, and cut-offs.
@@ -254,7 +254,7 @@ class _GaussianFit:
         self._rates = config.first_frame_rates.by_parameter(problem.extent)
         self._control = DensityControl(problem.cameras, config.density, problem.extent, rng)
 
-    def use(self, views: Sequence[View]) -> None:
+    def set_views(self, views: Sequence[View]) -> None:
         """Render and compare some views from now on."""
         self.views = [
             ObservedView.of(ActiveView(view.camera, self._render), Target(view.image, view.mask))
@@ -269,7 +269,7 @@ class _GaussianFit:
         """Return the Gaussians."""
         return self._start.with_parameters(values_of(self._optimizer))
 
-    def make(self, steps: Steps) -> dict[str, float]:
+    def run(self, steps: Steps) -> dict[str, float]:
         """Make some steps, and return their mean losses by name."""
         recorded_steps = None if self._steps is None else self._steps.of(len(self._start))
         return optimise(

@@ -72,8 +72,8 @@ class StepSetting:
     epsilon: float  #: Adam's.
     threads: int  #: Of Dr.Jit, which divide the adjoint (see `backend.sections`).
     sizes: PaddedSizes  #: Of the region.
-    #: Of the arrays of the view and of all views. Dr.Jit neither compares nor checks them: with
-    #: others, a recording writes outside of its arrays.
+    #: Lengths of the arrays of the view, then of the arrays that all views share. Dr.Jit does not
+    #: check them: a recording that is replayed with arrays of other lengths writes out of bounds.
     lengths: tuple[int, ...]
 
 

@@ -398,8 +398,8 @@ def _row_shape(name: str, width: int) -> tuple[int, ...]:
 
 
 def _columns(splats: Splats, size: int) -> dict[str, Any]:
-    """Return splats as arguments of a recording, in arrays of a fixed size: Dr.Jit infers the size
-    of a launch from the sizes of its arrays.
+    """Return splats as arguments of a recording, in arrays of a fixed size. A recording infers the
+    size of a launch from an array of that size, and lengths that vary can coincide with it.
     """
     names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid", "channels")
     lane = dr.arange(mi.UInt32, size)

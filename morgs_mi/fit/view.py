@@ -55,9 +55,8 @@ def withheld_blocks(
     withheld = []
     for view in views:
         view = view.reduced(width)
-        height, width = view.image.shape[:2]
-        rows = np.arange(height) // _BLOCK
-        columns = np.arange(width) // _BLOCK
+        rows = np.arange(view.camera.height) // _BLOCK
+        columns = np.arange(view.camera.width) // _BLOCK
         blocks = rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE
         is_withheld = blocks[rows][:, columns]
         valid = valid_pixels(view.mask, is_withheld.shape)

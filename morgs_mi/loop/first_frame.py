@@ -187,7 +187,7 @@ def fitted_first_frame(
     count = len(setup.points)
     if count < MIN_POINTS:
         problems.append(
-            f"too few points ({count}): {plan.first_count} others were placed by the images"
+            f"too few points ({count}): {plan.first_count} more were initialised from the images"
         )
     validation: dict[str, Any] = {}
     if len(views) > 1:

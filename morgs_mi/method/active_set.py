@@ -77,7 +77,7 @@ MIN_RESPONSIBILITY = 0.05
 # Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
 # hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
 # later.
-_MIN_WEIGHT = 0.2
+MIN_WEIGHT = 0.2
 # Responsibility below which an active Gaussian hardly changes.
 QUIET = 0.2
 # Number of views in which such Gaussians are rendered: in all 27 of basketball, a tenth more pixels
@@ -163,7 +163,7 @@ def responsibility(
     share = group.crop([view.share for view in changed])
     maps = np.stack([pixel_area * share, np.broadcast_to(pixel_area, share.shape)], axis=-1)
     change_weight, weight = group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
-    visible = weight > _MIN_WEIGHT
+    visible = weight > MIN_WEIGHT
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
     # view.
     boxes = changed_views.boxes

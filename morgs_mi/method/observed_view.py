@@ -25,7 +25,9 @@ class ObservedView(ActiveView):
 
     @cached_property
     def observations(self) -> dict[str, Any]:
-        """What renderings are compared with, by name: the target, and tensors on the region."""
+        """Target and observations by name; observations are tensors [H, W, ...], or [A, h, w, ...]
+        of the A blocks of a region.
+        """
         cropped = {name: self.crop(image) for name, image in self.observed.items()}
         tensors = {name: from_numpy(mi.TensorXf, image) for name, image in cropped.items()}
         return {"target": self.target, **tensors}

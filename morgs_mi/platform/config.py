@@ -98,7 +98,7 @@ def check_ranges(config: Any, place: str = "") -> None:
         check_value(place or f"{type(config).__name__}()", name, getattr(config, name), kind)
 
 
-def check_value(place: str, name: str, value: object, kind: Any) -> None:
+def check_value(place: str, name: str, value: object, kind: Any, remedy: str = "") -> None:
     """Raise an error unless the value of a field has its type and lies within its range.
 
     Args:
@@ -107,12 +107,14 @@ def check_value(place: str, name: str, value: object, kind: Any) -> None:
         value: of the field.
         kind: its type: numbers, strings, booleans, None, tuples, dicts, literals, classes, and
             unions of them.
+        remedy: what the caller of the program can do; empty: give such a value.
 
     Raises:
         ValueError: its type is another one, or it lies outside of its range.
     """
     if expected := _expected(value, kind):
-        raise ValueError(f"{place}: `{name}` must be {expected}, got {shortened(value)}.")
+        end = f"; {remedy}" if remedy else ""
+        raise ValueError(f"{place}: `{name}` must be {expected}, got {shortened(value)}{end}.")
 
 
 def config_or_default(

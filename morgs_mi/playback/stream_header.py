@@ -28,13 +28,14 @@ from morgs_mi.render.render_config import RenderConfig
 
 _Coordinate = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
 _Point = tuple[_Coordinate, _Coordinate, _Coordinate]
+_REMEDY = "fit the capture again"
 # Entries of the metadata that are read, with dots between the names of nested objects: their types,
 # and the values of missing ones. A stream may come from anybody, and its metadata be any object.
 _SCHEMA: dict[str, tuple[Any, Any]] = {
     "num_frames": (int, 0),
     "fingerprint": (str | None, None),  # imported streams have none
     "origin": (_Point, (0.0, 0.0, 0.0)),
-    BOX: (tuple[_Point, _Point], None),
+    BOX: (tuple[_Point, _Point] | None, None),  # recordings have none
     "distortions": (dict[str, tuple[_Coordinate, _Coordinate]], {}),
     "downscale": (float, 1),
     "test_view": (tuple[int | str, ...] | int | str | None, "auto"),
@@ -103,10 +104,10 @@ def metadata_entry(stream: FrameSource, key: str) -> Any:
     *tables, name = key.split(".")
     for table in tables:
         entries = entries.get(table, {})
-        check_value(_place(stream), key, entries, dict)
+        check_value(_place(stream), key, entries, dict, _REMEDY)
     if name in entries:
         value = _tuples(entries[name])
-        check_value(_place(stream), key, value, kind)
+        check_value(_place(stream), key, value, kind, _REMEDY)
     return value
 
 

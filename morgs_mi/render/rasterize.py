@@ -233,6 +233,8 @@ def render_view(
     if depth_limit is not None:
         limits = _depth_limits(place, depth_limit, view)
         projected = (*projected, "profile")
+    if means2d is not None:
+        _check_means2d(place, means2d, gaussians, view, depth_limit)
     if not int(gaussians.means.shape[0]):
         return _nothing(output, table, region, background)
     rows = None
@@ -249,7 +251,6 @@ def render_view(
     splats = project(gaussians, camera, projected, view.config, rows, table)
     absolute: tuple[Float, ...] = ()
     if means2d is not None:
-        _check_means2d(place, means2d, gaussians, view, depth_limit)
         probe: Any = dr.gather(mi.Vector4f, means2d.array, dr.arange(mi.UInt32, len(splats)))
         absolute = (probe.z, probe.w)
         splats = replace(splats, mean=splats.mean + probe.xy)

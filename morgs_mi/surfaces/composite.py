@@ -72,7 +72,7 @@ def composite(
     ground = mi.Color3f(0 if background is None or has_environment else background)
     L = mi.Color3f([view.image[:, :, k].array for k in range(3)])
     # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
-    # Quotients of vectors: that of a vector and a number is a product with its rounded inverse.
+    # The divisors are vectors: Dr.Jit divides a vector by a scalar by the rounded reciprocal.
     surface = dr.maximum(L - (1 - f) * E, 0) / mi.Color3f(dr.select(has_surface, f, 1))
     rest = dr.maximum(L - f * surface, 0) / mi.Color3f(dr.select(f < 1, 1 - f, 1))
     inner_color = decode(dr.fma(t_front, encode(surface), mi.Color3f(front["color"])))

@@ -27,10 +27,15 @@ from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.composite import Columns, composite, cropped
-from morgs_mi.surfaces.surface_view import Crop, SampledPixels, SurfaceView, ellipsoids_of
+from morgs_mi.surfaces.surface_view import (
+    PLACE,
+    Crop,
+    SampledPixels,
+    SurfaceView,
+    ellipsoids_of,
+)
 
 _log = logging.getLogger(__name__)
-_PLACE = "gaussian_splat"  # where its errors begin
 
 # Settings of the rasteriser that are properties of the plugin.
 _SETTINGS = (
@@ -86,7 +91,7 @@ def _background(value: Any) -> Any:
     is_color = values.size in (1, 3)
     require(
         (is_color or np.ndim(value) > 1) and values.dtype.kind in "fiu" and bounded(values),
-        _PLACE,
+        PLACE,
         "`background` must be one or three finite numbers, or an image of them",
         f"a {type(value).__name__}, {str(value)[:20]!r}",
         "pass a colour such as {'type': 'rgb', 'value': 1} or a mi.TensorXf [H, W, 3]",
@@ -98,21 +103,21 @@ def _check_surfaces(surfaces: Any, background: Any) -> None:
     """Raise an error unless an integrator can render the surfaces."""
     require(
         isinstance(surfaces, mi.Integrator) and not isinstance(surfaces, GaussianSplatIntegrator),
-        _PLACE,
+        PLACE,
         "`surfaces` must be an integrator of surfaces such as {'type': 'path'}",
         repr(surfaces),
         "pass another one",
     )
     require(
         background is None or isinstance(background, mi.Color3f),
-        _PLACE,
+        PLACE,
         "`background` must be a colour with `surfaces`",
         "an image",
         "give the scene an `envmap` emitter",
     )
     require(
         mi.is_rgb,
-        _PLACE,
+        PLACE,
         "with `surfaces`, expected a variant such as 'llvm_ad_rgb'",
         repr(mi.variant()),
         "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours",
@@ -125,23 +130,20 @@ def _check_scene(
     """Raise an error unless a scene can be rendered."""
     require(
         not mi.has_flag(film.flags(), mi.FilmFlags.Special),
-        _PLACE,
+        PLACE,
         "expected an `hdrfilm`",
         film.class_name(),
         "replace it, because only RGB is drawn",
     )
-    for name, is_set in (("sample_border` in its film", border), ("surfaces`", with_surfaces)):
-        require(
-            num_views == 1 or not is_set,
-            _PLACE,
-            f"expected a `batch` sensor without `{name}",
-            "both",
-            "render its sensors one by one",
-        )
+    if num_views > 1:
+        views = f"a `batch` of {num_views} sensors"
+        remedy = "render its sensors one by one"
+        require(not border, PLACE, "expected a film without `sample_border`", views, remedy)
+        require(not with_surfaces, PLACE, "expected one sensor with `surfaces`", views, remedy)
     for shape in scene.shapes():
         require(
             with_surfaces or shape.is_ellipsoids(),
-            _PLACE,
+            PLACE,
             "expected `ellipsoids` shapes only",
             f"{shape.class_name()} {shape.id()!r}",
             "remove it from the scene, or set `surfaces` to an integrator that renders it, such as "
@@ -149,7 +151,7 @@ def _check_scene(
         )
     require(
         ellipsoids_of(scene),
-        _PLACE,
+        PLACE,
         "expected a scene with an `ellipsoids` shape",
         "none",
         "add one",
@@ -320,16 +322,16 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         super().__init__(props)
         for name, kind in (("srgb_primitives", bool), ("aovs", str)):
             if name in props:
-                check_value(_PLACE, name, props[name], kind)
+                check_value(PLACE, name, props[name], kind)
         self.srgb_primitives = props.get("srgb_primitives", True)
-        with errors_at(_PLACE):
+        with errors_at(PLACE):
             self.config = RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
+        choices = aov_attributes()
+        expected = f"`aovs` must be out of {', '.join(choices)}"
         for name in self.aovs:
-            names = aov_attributes()
-            expected = f"`aovs` must be out of {', '.join(names)}"
-            require(name in names, _PLACE, expected, repr(name), "separate them by commas")
+            require(name in choices, PLACE, expected, repr(name), "separate them by commas")
         self.background = _background(props.get("background", None))
         self.surfaces = props.get("surfaces", None)
         if self.surfaces is not None:
@@ -367,7 +369,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         evaluate: bool = True,
     ) -> Tensor:
         # Before any memory is released, which would end the process.
-        refuse_freezing(_PLACE)
+        refuse_freezing(PLACE)
         self.forward_pass = None
         with dr.resume_grad():
             inputs = self._inputs(scene, sensor)

@@ -26,6 +26,8 @@ from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.surfaces.splat_rays import SplatRays
 
 _log = logging.getLogger(__name__)
+PLACE = "gaussian_splat"
+"""Where the errors of the plugin begin."""
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
 
@@ -94,10 +96,9 @@ def surface_scene(scene: mi.Scene) -> mi.Scene | None:
     surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not surfaces and scene.environment() is None:
         return None
-    place = "gaussian_splat"
     require(
         scene.emitters(),
-        place,
+        PLACE,
         "expected an emitter that lights the surfaces",
         "none",
         "add one to the scene, such as an `envmap` of morgs_mi.light_probe()",
@@ -106,14 +107,14 @@ def surface_scene(scene: mi.Scene) -> mi.Scene | None:
         name = f"{shape.class_name()} {shape.id()!r}"
         require(
             not shape.is_medium_transition(),
-            place,
+            PLACE,
             "expected surfaces",
             f"{name}, the boundary of a medium",
             "remove the medium, because splats have no place in the order of a volume's light",
         )
         require(
             shape.bsdf() is not None,
-            place,
+            PLACE,
             f"the {name} must have a BSDF",
             "none",
             "set `bsdf` where the shape is defined",
@@ -249,7 +250,7 @@ class SurfaceView:
             image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.spp))
             if image.shape[2] < 3:
                 raise ValueError(
-                    "gaussian_splat: `surfaces` must be an integrator of colours, got one of "
+                    f"{PLACE}: `surfaces` must be an integrator of colours, got one of "
                     f"{integrator.aov_names()} alone; put a `path` into it."
                 )
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
@@ -310,7 +311,7 @@ class SurfaceView:
         moving = [name for name in attached if params.flags(name) & mi.ParamFlags.Discontinuous]
         if moving:
             _log.warning(
-                "gaussian_splat: gradients of the surfaces' positions lack what changes with "
+                f"{PLACE}: gradients of the surfaces' positions lack what changes with "
                 "their silhouettes and depth; do not optimise `%s` with it.",
                 "`, `".join(moving),
             )

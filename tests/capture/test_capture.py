@@ -88,8 +88,9 @@ def test_load_capture__selects_the_held_out_view(tmp_path):
     (path / "capture.json").write_text('{"test_view": [4, 1]}')
     assert load_capture(path).test_views == (1, 4)
     assert load_capture(path).train_views == (0, 2, 3, 5)
-    (path / "capture.json").write_text('{"test_view": null}')
-    assert load_capture(path).test_views == ()
+    for none in ("null", "[]"):
+        (path / "capture.json").write_text(f'{{"test_view": {none}}}')
+        assert load_capture(path).test_views == ()
 
 
 def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(tmp_path, caplog):

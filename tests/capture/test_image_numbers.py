@@ -51,6 +51,11 @@ def test_align_numbers__are_times(tmp_path, caplog, a, b, common, interval):
         assert [row[camera] for row in timestamps if row[camera] is not None] == list(numbers)
 
 
+def test_align_numbers__of_a_single_image_are_times(tmp_path):
+    capture = load_capture(capture_of(tmp_path / "c", a=range(10), b=[5]), reading=TRIM)
+    assert frame_numbers(capture) == [[5, 5]]
+
+
 def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(tmp_path):
     path = capture_of(tmp_path / "c", a=range(4), b=range(2, 6))
     message = r"got a 0 to 3, b 2 to 5; use the 2 common .*--trim, .*--gaps.*--offset a 0"

@@ -72,7 +72,7 @@ def test_commands__name_what_was_expected_in_a_first_mistake(
 
 
 @pytest.mark.parametrize("name", ["info", "calibrate", "fit", "live"])
-def test_commands__name_the_option_of_cameras_that_are_left_out(name, capture, tmp_path, run):
+def test_commands__name_the_field_of_cameras_that_are_left_out(name, capture, tmp_path, run):
     out = tmp_path / "out"
     words = {
         "info": (capture,),

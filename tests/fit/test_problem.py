@@ -106,6 +106,12 @@ def test_withheld_blocks__divide_the_valid_pixels():
         assert b.mask.sum() / allowed.sum() == pytest.approx(1 / 8, abs=0.06)
 
 
+def test_withheld_blocks__reduce_each_view_to_the_least_width():
+    views = [large_view(), large_view().reduced(80), large_view()]
+    rest, _ = withheld_blocks(views, 80, np.random.default_rng(0))
+    assert [view.camera.width for view in rest] == [80, 80, 80]
+
+
 def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
 

@@ -63,7 +63,7 @@ def test_push__seeds_points_where_no_camera_sees_the_given_ones(caplog):
     _, report = loop.push(images())
     assert report.status == (
         "the cameras see 0 % of the 200 points, which are not used: check their axes and units; "
-        "too few points (0): 200 others were placed by the images"
+        "too few points (0): 200 more were initialised from the images"
     )
     assert report.psnr > 15
     warnings = [record.getMessage() for record in caplog.records]

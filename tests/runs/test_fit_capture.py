@@ -493,8 +493,9 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(
     tmp_path_factory, monkeypatch
 ):
     changes = np.full((2, 11), 1e-3)  # by features, of which the images have too few
-    problem = "morgs_mi.extras.calibration.refine._Problem.matched"
-    monkeypatch.setattr(problem, lambda _: (changes, 100))
+    monkeypatch.setattr(
+        "morgs_mi.extras.calibration.refine.RefinementProblem.matched", lambda _: (changes, 100)
+    )
     tmp_path = tmp_path_factory.mktemp("out")
     config = refined_config()
     capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)

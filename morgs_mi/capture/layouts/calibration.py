@@ -345,7 +345,8 @@ def _frames_of_cameras(source: Path, match: _Match) -> _Match:
     """Return the match with one clip, named after the first, for all photos of equal pose and lens.
 
     Raises:
-        ValueError: some have several photos, and the numbers of theirs differ or have gaps.
+        ValueError: cameras have several photos each, whose numbers differ between cameras or have
+            gaps.
     """
     photos_of: dict[Hashable, dict[str, Path]] = {}
     for name in sorted(match.images, key=natural_key):

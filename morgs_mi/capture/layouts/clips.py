@@ -72,12 +72,16 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     Raises:
         ValueError: two videos in one folder differ only in their suffixes.
     """
+    places = _places(path)
+    others = [place for place in places if place.name not in _USUAL]
+    names = [name for place in others for name in _clips(place)]
     clips: dict[str, Path] = {}
-    for place in _places(path):
+    if len({*names}) < len(names):  # rigs and memory cards repeat the names of their clips
+        clips |= clips_by_rig(path)
+        places = places[len(others) :]
+    for place in places:
         inner = _clips(place)
         if repeats := [name for name in inner if name in clips]:
-            if place.name not in _USUAL:
-                return clips_by_rig(path)  # rigs and memory cards repeat the names of their clips
             first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, inner))
             _LOG.warning("%s: clips such as %s are used, not %s.", path, last, first)
         clips |= inner

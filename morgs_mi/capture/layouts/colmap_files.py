@@ -55,7 +55,9 @@ def model_file(folder: Path, name: str) -> Path:
 
 
 def read_cameras(path: Path) -> Iterator[tuple[int, str, int, int, Sequence[float]]]:
-    """Return the rows of `cameras.bin` or `cameras.txt`."""
+    """Yield (camera id, model, width, height, parameters) of each row of `cameras.bin` or
+    `cameras.txt`; ValueError: a row is broken.
+    """
     return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
 
 

@@ -177,7 +177,7 @@ def refine_cameras(
         ValueError: fewer than two training views have an image of the first frame.
     """
     render = config_or_default("refine_cameras()", render, RenderConfig(), "render")
-    problem = _Problem.of(capture, config, render, seed)
+    problem = RefinementProblem.of(capture, config, render, seed)
     changes, tracks = problem.matched()
     scores = [float("nan")] * 2
     if tracks and config.refine_cameras == "auto":
@@ -195,7 +195,7 @@ def refine_cameras(
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class RefinementProblem:
     """Cameras to refine, and the images that evaluate them."""
 
     capture: Capture  # capture with the calibrated cameras
@@ -208,7 +208,9 @@ class _Problem:
     seed: int  # seed of all random choices
 
     @classmethod
-    def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
+    def of(
+        cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int
+    ) -> RefinementProblem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
         views = next(capture.displayed().partial_frames(0, 1)).views
         train = {v: views[v] for v in capture.train_views if views[v].has_image}

@@ -163,6 +163,8 @@ class CameraFeed:
             for name, shots in groups.items()
         }
         times = [shot.time for shot in chosen.values()]
+        if max(times) - min(times) > _MAX_SKEW:
+            return None
         skipped = min(shot.number - numbers[name] - 1 for name, shot in chosen.items())
         return FrameSet(
             {name: shot.image for name, shot in chosen.items()},

@@ -33,6 +33,10 @@ Source = int | str | Path
 """A camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens."""
 
 RETRY = 1.0  # pause before a source is opened again, s
+# Reads in succession that fail before a source counts as ended, and the pause after one, s: a
+# camera may lose an image.
+_FAILURES = 10
+_PAUSE = 0.02
 # Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few
 # seconds.
 _SILENCE = 10.0
@@ -177,8 +181,10 @@ def read_camera(
 
 def read_once(
     source: Source, closed: Event, size: tuple[int, int] | None = None
-) -> Iterator[np.ndarray]:
-    """Yield the images of a source, which is opened once, until a read fails; see `read_camera`."""
+) -> Iterator[np.ndarray | None]:
+    """Yield the images of a source, which is opened once, with None for a read that fails, until
+    ten in succession fail; see `read_camera`.
+    """
     if isinstance(source, int):
         stream = cv2.VideoCapture(source)
     else:
@@ -191,12 +197,14 @@ def read_once(
     if isinstance(source, int) and size is not None:
         stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    failures = 0
     try:
-        while not closed.is_set():
+        while failures < _FAILURES and not closed.is_set():
             is_read, image = stream.read()
+            failures = 0 if is_read else failures + 1
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
             if not is_read:
-                return
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+                closed.wait(_PAUSE)
     finally:
         stream.release()
 

@@ -22,9 +22,14 @@ class Format:
     folder: bool = False
     endings: tuple[str, ...] = ()  #: Ends of the names of such folders; none: no suffix.
 
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """The suffix of its files; none for a folder for a web server."""
+        return (f".{self.name}",) if self.name else ()
+
     def is_file(self, output: str | Path) -> bool:
         """Return whether an output of this format is a file."""
-        return not self.folder or Path(output).name.lower().endswith(f".{self.name}")
+        return not self.folder or Path(output).name.lower().endswith(self.suffixes)
 
 
 PLY = (
@@ -56,7 +61,7 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
         return formats[0]
     name = Path(output).name.lower()
     for choice in sorted(formats, key=lambda choice: len(choice.name), reverse=True):
-        if name.endswith((f".{choice.name}", *choice.endings)):
+        if name.endswith((*choice.suffixes, *choice.endings)):
             return choice
     suffix = re.search(r"\.[a-z]\w*$", name)
     folders = [choice for choice in formats if choice.folder]

@@ -153,6 +153,19 @@ def test_match_clips__reads_folders_of_folders(tmp_path, files, names):
     assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
+def test_match_clips__uses_the_clips_in_the_capture_beside_copies_of_them(tmp_path):
+    names = ("cam01", "cam02")
+    for folder in ("backup", "proxies"):
+        (tmp_path / folder).mkdir()
+        for i, name in enumerate(names):
+            write_video(tmp_path / folder / f"{name}.mkv", layouts.frames(5 + i), FPS)
+    layouts.videos(tmp_path, names)
+    write_colmap(tmp_path / "sparse/0", rig(names))
+    capture = load_capture(tmp_path)
+    assert capture.names == names
+    assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1]
+
+
 @pytest.mark.parametrize("count", [COUNT, 1])
 def test_match_clips__of_photos_with_equal_poses_reads_frames(tmp_path, count):
     """One photo of each camera is a static scene."""

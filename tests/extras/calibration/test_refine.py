@@ -11,7 +11,7 @@ from morgs_mi.core.view import View, Views
 from morgs_mi.extras.calibration.bundle import changed_camera
 from morgs_mi.extras.calibration.refine import (
     Refinement,
-    _Problem,
+    RefinementProblem,
     refine_cameras,
     register_camera,
 )
@@ -76,7 +76,9 @@ def splat_capture(tmp_path_factory):
 @pytest.fixture
 def matched(monkeypatch):
     """Changes of cameras in place of those by features, which splats do not have."""
-    monkeypatch.setattr(_Problem, "matched", lambda self: (wrong_changes(len(self.indices)), 100))
+    monkeypatch.setattr(
+        RefinementProblem, "matched", lambda self: (wrong_changes(len(self.indices)), 100)
+    )
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0])
@@ -153,7 +155,7 @@ def test_refine_cameras__keeps_cameras_with_few_features(splat_capture, mode):
 
 def changes_of(capture):
     """Return the changes of the training cameras by features, and the number of tracks."""
-    return _Problem.of(capture, FitConfig(), RenderConfig(), 0).matched()
+    return RefinementProblem.of(capture, FitConfig(), RenderConfig(), 0).matched()
 
 
 @pytest.mark.slow

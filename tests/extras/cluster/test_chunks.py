@@ -242,8 +242,9 @@ def test_ChunkedRun__triangulates_points_where_there_are_few(
 def test_ChunkedRun__refines_cameras_once(capture, client, tmp_path, monkeypatch):
     held_out = load_capture(capture.path, test_view=0)
     changes = np.full((len(held_out.train_views), 11), 1e-3)  # images have too few features
-    problem = "morgs_mi.extras.calibration.refine._Problem.matched"
-    monkeypatch.setattr(problem, lambda _: (changes, 100))
+    monkeypatch.setattr(
+        "morgs_mi.extras.calibration.refine.RefinementProblem.matched", lambda _: (changes, 100)
+    )
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on"))
     fit(held_out, tmp_path / "three", client, config=config)
     stream = StreamReader(tmp_path / "three" / "stream.morgs")

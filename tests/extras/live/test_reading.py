@@ -21,16 +21,24 @@ def test_read_camera__opens_a_broken_connection_again(monkeypatch):
     missing = connection(opens=False)
     opens = Mock(side_effect=[connection(IMAGE, IMAGE), missing, connection(IMAGE, IMAGE)])
     monkeypatch.setattr(cv2, "VideoCapture", opens)
-    images = list(islice(read_camera(url, Event()), 6))
+    images = list(islice(read_camera(url, Event()), 16))  # ten reads fail before the next attempt
     assert sum(image is not None for image in images) == 4
     assert [call.args[0] for call in opens.call_args_list] == [url] * 3
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: connection(IMAGE, IMAGE))
-    assert len(list(read_once(url, Event()))) == 2
+    assert sum(image is not None for image in read_once(url, Event())) == 2
     closed = Event()
     closing = read_camera(url, closed)
     assert next(closing) is not None
     closed.set()
     assert list(closing) == []
+
+
+def test_read_once__continues_after_a_failed_read(monkeypatch):
+    camera = connection(IMAGE, IMAGE)
+    camera.read.side_effect = [(True, IMAGE), (False, None), (True, IMAGE), *[(False, None)] * 99]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: camera)
+    images = [image is not None for image in read_once(0, Event())]
+    assert images == [True, False, True] + 10 * [False]
 
 
 def test_read_camera__requests_the_size_of_a_camera_of_this_machine(monkeypatch):

@@ -26,20 +26,20 @@ def test_consistency_mask__samples_the_flow_back_where_the_flow_leads():
 
 
 @pytest.mark.parametrize(
-    ("back", "relative", "absolute", "passes"),
+    ("back", "tolerances", "passes"),
     [
         # |F| = 6: a squared mismatch of 0.01 (36 + |B|^2) + 0.5 is tolerated.
-        (-7.0, 0.01, 0.5, True),
-        (-7.5, 0.01, 0.5, False),
-        (-7.0, 0, 0.5, False),
-        (-7.0, 0.01, 0, False),
-        (-7.5, 0.03, 0.5, True),
-        (-7.5, 0.01, 2, True),
+        (-7.0, {}, True),
+        (-7.5, {}, False),
+        (-7.0, {"RELATIVE": 0}, False),
+        (-7.0, {"ABSOLUTE": 0}, False),
+        (-7.5, {"RELATIVE": 0.03}, True),
+        (-7.5, {"ABSOLUTE": 2}, True),
     ],
 )
-def test_consistency_mask__tolerates_a_mismatch(monkeypatch, back, relative, absolute, passes):
-    monkeypatch.setattr("morgs_mi.method.flow.RELATIVE_TOLERANCE", relative)
-    monkeypatch.setattr("morgs_mi.method.flow.ABSOLUTE_TOLERANCE", absolute)
+def test_consistency_mask__tolerates_a_mismatch(monkeypatch, back, tolerances, passes):
+    for kind, tolerance in tolerances.items():
+        monkeypatch.setattr(f"morgs_mi.method.flow.{kind}_TOLERANCE", tolerance)
     mask = consistency_mask(constant_flow(6), constant_flow(back))
     assert mask[:, :20].all() == passes
     assert mask[:, :20].any() == passes

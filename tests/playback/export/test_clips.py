@@ -69,7 +69,9 @@ def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
     assert run("export", "ply", tmp_path, "--frames", "0") == 0
     assert "relative to the origin (500000, 5300000, 0)" in capsys.readouterr().out
     write_web_folder(stream, tmp_path / "web")
-    assert StreamReader(tmp_path / "web/stream.morgs").metadata["origin"] == metadata["origin"]
+    published = tmp_path / "web/stream.morgs"
+    assert StreamReader(published).metadata["origin"] == metadata["origin"]
+    assert run("export", "web", published, tmp_path / "again.html") == 0
 
 
 @pytest.mark.parametrize("name", ["orbit", "between", "path.json"])
