@@ -278,7 +278,7 @@ def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
 
 def test_gaussian_splat__refuses_a_batch_with_a_border(raw):
     scene, _ = batch_scene(raw, {"sample_border": True, "rfilter": {"type": "gaussian"}})
-    with pytest.raises(ValueError, match="expected a `batch` sensor without `sample_border`"):
+    with pytest.raises(ValueError, match="a film without `sample_border`, got a `batch` of 3"):
         scene.integrator().render(scene)
 
 
