@@ -108,6 +108,9 @@ class Render:
                 )
             channels = ("color", "alpha")
         on_background(stream, "black" if is_transparent else self.background)
+        shown = channels
+        if channels and chosen.name != "exr" and "motion" in channels:  # over the grey colour
+            channels = tuple(dict.fromkeys((*channels, "color")))
         images, count = self.images(stream, view, channels, single)
         if single and count > 1:
             raise ValueError(
@@ -121,6 +124,7 @@ class Render:
                 rendering(report, count),
                 shown_exposure(stream, self.display_exposure),
                 is_transparent,
+                shown,
             )
         print_result(f"{output}: {quantity(count, 'image')}.")
         if self.path is not None:

@@ -1,5 +1,6 @@
 """`morgs-mi render`: bad input, and outputs that could not be finished."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -35,6 +36,16 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path, run):
         writer.write(keyframe_packet(empty, 0))
     assert run("render", tmp_path / "s.morgs", tmp_path / "exr", "--camera", 0)[0] == 0
     assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
+
+
+def test_render__draws_motion_over_the_grey_colour_also_alone(stream, tmp_path, run):
+    args = ("--camera", "cam0", "--channels")
+    assert run("render", stream, tmp_path / "motion_png", *args, "motion")[0] == 0
+    assert run("render", stream, tmp_path / "both_png", *args, "motion", "color")[0] == 0
+    motion = cv2.imread(str(tmp_path / "motion_png" / "0001.png"))
+    both = cv2.imread(str(tmp_path / "both_png" / "0001.png"))
+    assert motion.shape[1] < both.shape[1] / 2
+    np.testing.assert_array_equal(motion, both[:, : motion.shape[1]])
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ def write_images(
     progress: Callable[[int], None] | None = None,
     display_exposure: float = 0.0,
     transparent: bool = False,
+    shown: Sequence[str] | None = None,
 ) -> None:
     """Write rendered frames, pairs of index and channels [H, W, C] by name, into files, atomically.
 
@@ -47,6 +48,8 @@ def write_images(
         transparent: write colour and alpha, rendered over black, as PNG files with straight alpha;
             programs composite these in sRGB, as splats are blended, and differ by up to 0.14 where
             they do in linear light.
+        shown: channels in videos and PNG files, out of those that were rendered; None: all. Motion
+            is over the grey colour if that was rendered as well.
 
     Raises:
         ValueError: another type of video.
@@ -66,7 +69,7 @@ def write_images(
 
     frames = display_frames()
     if kind in _ENCODERS:
-        movie = (pad_to_even(_combined_image(images)) for _, images in frames)
+        movie = (pad_to_even(_combined_image(images, shown)) for _, images in frames)
         write_video(output, movie, fps, _ENCODERS[kind])
         return
     is_file = choice.is_file(output)
@@ -86,7 +89,7 @@ def write_images(
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(png_bytes(rgba))
             else:
-                write_png(path, _combined_image(images))
+                write_png(path, _combined_image(images, shown))
 
 
 def exr_channels(images: Arrays) -> Arrays:
@@ -121,7 +124,7 @@ def pad_to_even(image: np.ndarray) -> np.ndarray:
     return np.pad(image, ((0, H % 2), (0, W % 2), (0, 0)), mode="edge")
 
 
-def _combined_image(images: Arrays) -> np.ndarray:
-    return side_by_side(
-        [explained_image(name, image, color=images.get("color")) for name, image in images.items()]
-    )
+def _combined_image(images: Arrays, shown: Sequence[str] | None) -> np.ndarray:
+    color = images.get("color")
+    names = images if shown is None else shown
+    return side_by_side([explained_image(name, images[name], color=color) for name in names])
