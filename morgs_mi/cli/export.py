@@ -31,6 +31,7 @@ from morgs_mi.cli.streams import (
     relative_to,
     rendering,
     shown_exposure,
+    with_first_camera,
 )
 from morgs_mi.platform.checks import quantity
 from morgs_mi.platform.extras import extra, places
@@ -158,7 +159,6 @@ class Web(ExportKind):
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
-        from morgs_mi.playback.stream_header import find_camera
 
         if self.background is not None and chosen.folder:
             raise ValueError(
@@ -166,9 +166,7 @@ class Web(ExportKind):
                 "unchanged."
             )
         on_background(stream, self.background)
-        if self.camera is not None:
-            first = find_camera(stream, self.camera)
-            stream.cameras = (first, *(c for c in stream.cameras if c is not first))
+        with_first_camera(stream, self.camera)
         total = len(frame_numbers(stream))
         write = write_web_folder if chosen.folder else write_web_page
         size = write(stream, output, self.title, lambda done: report("Checking", done, total))

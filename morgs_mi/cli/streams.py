@@ -63,6 +63,21 @@ def on_background(stream: FrameSource, color: str | None) -> None:
     stream.metadata = {**stream.metadata, "config": {**config, "render": render}}
 
 
+def with_first_camera(stream: FrameSource, camera: str | None) -> str | None:
+    """Put the camera at which a page opens before the others, and return its name; None: leave it.
+
+    Raises:
+        ValueError: the stream has no such camera.
+    """
+    from morgs_mi.playback.stream_header import find_camera
+
+    if camera is None:
+        return None
+    first = find_camera(stream, camera)
+    stream.cameras = (first, *(other for other in stream.cameras if other is not first))
+    return first.name
+
+
 def opened(
     out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False
 ) -> FrameSource:

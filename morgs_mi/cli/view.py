@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
 from morgs_mi.cli.settings import optional, options
-from morgs_mi.cli.streams import DropInvalid, PageCamera, opened, print_view
+from morgs_mi.cli.streams import DropInvalid, PageCamera, opened, print_view, with_first_camera
 
 
 @options
@@ -36,13 +36,13 @@ class ViewStream:
     drop_invalid: DropInvalid = False
 
     def run(self) -> None:
-        from morgs_mi.playback.stream_header import find_camera
         from morgs_mi.playback.viewer.server import Viewer
 
         stream = opened(self.source, self.drop_invalid)
         wishes = ["follow"] if self.follow else []
-        if self.camera is not None:
-            wishes.append(f"camera={quote(find_camera(stream, self.camera).name)}")
+        name = with_first_camera(stream, self.camera)
+        if name is not None:
+            wishes.append(f"camera={quote(name)}")
         viewer = Viewer(stream, self.host, self.port, self.capture)
         url = f"{viewer.url}#{'&'.join(wishes)}" if wishes else viewer.url
         print_result(f"{url} (Ctrl-C to stop)")

@@ -2,6 +2,7 @@
 requests.
 """
 
+import html
 import json
 import os
 import re
@@ -11,8 +12,8 @@ import subprocess
 import sys
 import webbrowser
 from concurrent.futures import ThreadPoolExecutor
-from threading import Lock
-from urllib.parse import urlsplit
+from threading import Lock, Thread
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
@@ -573,6 +574,24 @@ def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, link, 
     assert opened == ([] if opens is None else [url[0] + opens])
     note = "Other machines open the same link with the address of this machine in digits."
     assert (note in output) == ("--host" in args)
+
+
+def test_view__shows_the_first_frame_from_the_camera_until_the_page_draws(clip, monkeypatch):
+    run = Viewer.run
+    pages = []
+
+    def visited(viewer):
+        thread = Thread(target=run, args=(viewer,))
+        thread.start()
+        pages.append(get(viewer.url)[1].decode())
+        viewer.stop()
+        thread.join(60)
+
+    monkeypatch.setattr(Viewer, "run", visited)
+    assert main(["view", str(clip[0]), "--no-browser", "--camera", "right"]) == 0
+    (poster,) = re.findall('src="(exact/[^"]+)"', pages[0])
+    camera = parse_qs(urlsplit(html.unescape(poster)).query)["camera"][0]
+    assert json.loads(camera)["name"] == "right"
 
 
 def test_view__refuses_a_port_that_is_taken(clip, capsys):
