@@ -192,7 +192,7 @@ class ComparedView:
         return cls(view.camera, region, on, view.config.background)
 
 
-class Rooms:
+class SharedSizes:
     """Sizes that the arrays of all views of a frame fit in: views whose images have the same size
     have the same sizes.
 
@@ -269,11 +269,11 @@ class LaterSteps:
         self._objective = objective
         self._views: dict[int, StepView] = {}
         compared_views = {v: ComparedView.of(view) for v, view in views.items()}
-        rooms = Rooms([*compared_views.values()])
+        shared_sizes = SharedSizes([*compared_views.values()])
         for v, compared_view in compared_views.items():
             view = views[v]
             region = compared_view.region
-            sizes = rooms.sizes(region)
+            sizes = shared_sizes.sizes(region)
             images = {name: view.crop(array) for name, array in view.observed.items()}
             observed = {"target": None, **images}
             channels = channels_of(observed, objective)
@@ -281,7 +281,7 @@ class LaterSteps:
                 name: image.shape if region.whole else (sizes.num_blocks, *image.shape[1:])
                 for name, image in images.items()
             }
-            packing, arrays = rooms.arrays(compared_view)
+            packing, arrays = shared_sizes.arrays(compared_view)
             static = view.static_splats
             if static is None:
                 arrays["static"] = _no_static(channels, static_size)
@@ -349,14 +349,14 @@ class FirstSteps:
         rng: np.random.Generator,
     ) -> None:
         compared_views = [ComparedView.of(view) for view in views]
-        rooms = Rooms(compared_views)
+        shared_sizes = SharedSizes(compared_views)
         render = views[0].config
         self._views: dict[int, StepView] = {}
         for v, view in enumerate(compared_views):
-            packing, arrays = rooms.arrays(view)
+            packing, arrays = shared_sizes.arrays(view)
             losses = FirstLosses(packing, dssim_weight, dropout, render)
             names = ("recon", SQUARED_ERROR)
-            self._views[v] = StepView(losses, names, rooms.sizes(view.region), arrays)
+            self._views[v] = StepView(losses, names, shared_sizes.sizes(view.region), arrays)
         self._dropout = dropout
         self._rng = rng
 

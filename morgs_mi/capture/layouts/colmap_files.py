@@ -62,12 +62,16 @@ def read_cameras(path: Path) -> Iterator[tuple[int, str, int, int, Sequence[floa
 
 
 def read_images(path: Path) -> Iterator[tuple[str, int, Sequence[float]]]:
-    """Return the rows of `images.bin` or `images.txt`."""
+    """Yield (name, index of the camera, pose) of each image of `images.bin` or `images.txt`; the pose
+    is the quaternion (w, x, y, z) of the rotation and the translation, world to camera [7].
+    """
     return _binary_images(path) if path.suffix == ".bin" else _text_images(path)
 
 
 def read_points(path: Path) -> Iterator[list[float]]:
-    """Return the rows of `points3D.bin` or `points3D.txt`."""
+    """Yield the position and the colour, 0 to 255, of each point of `points3D.bin` or
+    `points3D.txt` [6].
+    """
     return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
 
 
