@@ -62,8 +62,8 @@ def read_cameras(path: Path) -> Iterator[tuple[int, str, int, int, Sequence[floa
 
 
 def read_images(path: Path) -> Iterator[tuple[str, int, Sequence[float]]]:
-    """Yield (name, index of the camera, pose) of each image of `images.bin` or `images.txt`; the pose
-    is the quaternion (w, x, y, z) of the rotation and the translation, world to camera [7].
+    """Yield the name, the id of the camera and the pose of each image of `images.bin` or
+    `images.txt`: quaternion (w, x, y, z) and translation, world to camera [7].
     """
     return _binary_images(path) if path.suffix == ".bin" else _text_images(path)
 
