@@ -50,7 +50,6 @@ VALUES = {
 }
 # Fields that cannot change this stream, each with the reason and the test that shows that it acts.
 ELSEWHERE = {
-    "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
     "fit.camera_priors": "the recorder refines cameras: tests/extras/calibration/test_bundle.py",
     "fit.short_fits": (
@@ -61,7 +60,6 @@ ELSEWHERE = {
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_dropout.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
-    "motion.search": "flow explains all parts here: tests/method/test_search.py",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
     "fit.objective.terms": "the package has no further term: tests/fit/test_later_frame.py",

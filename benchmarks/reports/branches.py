@@ -259,7 +259,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_SEARCH, "least size of a part", {"method.search:_MIN_SIZE": 1}),
     Branch(_SEARCH, "clear gain of the cost", {"method.search:_COST_RATIO": 1.0}),
     Branch(_SEARCH, "clear gain of the images", {"method.search:_ERROR_RATIO": 1.0}),
-    Branch(_SEARCH, "further parts", {"motion.search.max_parts": 1}),
+    Branch(_SEARCH, "further parts", {"method.search:_MAX_PARTS": 1}),
     Branch(_SEARCH, "reduced images", {"method.search:_reduction": lambda *_: 1}),
     # method.motion
     Branch(_REFINE, "pixels of neighbours", {"method.motion:_NEAREST": 0}),
@@ -348,7 +348,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_POINTS, "extent of distant scenes", {"fit.initialise:_DEPTH": 0.0}, True),
     # fit.detail, fit.budget
     Branch(_PLAN, "noise in details", {"fit.detail:_NOISE": 0.0}, True),
-    Branch(_PLAN, "least number of Gaussians", {"fit.detail.least_gaussians": 1}, True),
+    Branch(_PLAN, "least number of Gaussians", {"fit.budget:_LEAST_GAUSSIANS": 1}, True),
     Branch(_PLAN, "Gaussians that grow in the plan", {"fit.budget:_GROWING": 1.0}, True),
     # Constants of one meaning at one value.
     Branch(_SHARED, "gain of a proposal that does not move", {"method.motion:_ERROR_RATIO": 0.8}),

@@ -29,10 +29,13 @@ from morgs_mi.core.rig import mean_views
 from morgs_mi.core.view import View
 from morgs_mi.fit.detail import count_details
 from morgs_mi.fit.first_frame import LAST_ROUND
-from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.fit_config import MOST_GAUSSIANS, FitConfig
 from morgs_mi.fit.view import half_sized
 from morgs_mi.platform.memory import check_memory
 
+# Gaussians per detail that the views do not share, and the least number of them.
+_PER_DETAIL = 1.5
+_LEAST_GAUSSIANS = 4_000
 # Seconds of a first frame without a limit, on the reference machine.
 _SECONDS = 120.0
 # Seconds of a step per Gaussian, and per pixel of its view.
@@ -87,11 +90,10 @@ def plan_first_frame(
 
     if config.num_gaussians is None:
         # The most Gaussians that fit into the time, of those that the images ask for.
-        how = config.detail
         details = sum(count_details(view.image, view.mask) for view in views)
-        count = how.per_detail * details / mean_views([view.camera for view in views], points)
-        most = int(np.clip(round(count), how.least_gaussians, how.most_gaussians))
-        least = min(max(how.least_gaussians, most // _LEAST_SHARE), most)
+        count = _PER_DETAIL * details / mean_views([view.camera for view in views], points)
+        most = int(np.clip(round(count), _LEAST_GAUSSIANS, MOST_GAUSSIANS))
+        least = min(max(_LEAST_GAUSSIANS, most // _LEAST_SHARE), most)
         too_many = bisect_left(
             range(least + 1, most + 1),
             True,

@@ -15,6 +15,10 @@ from morgs_mi.platform.config import Count, NonNegative, NonNegativeInt, Positiv
 _CONSTANT_EPOCHS = 2
 # Epochs of a later frame that its learning rates were chosen for: they are larger in fewer epochs.
 _USUAL_EPOCHS = 8
+MOST_GAUSSIANS = 250_000
+"""Largest number of Gaussians of a first frame whose number is not given, for memory, the time of
+later frames and the size of the stream.
+"""
 # Least number of steps of a first frame.
 _LEAST_STEPS = 1200
 # Gaussians of a first frame per step: many see each pixel less often.
@@ -82,26 +86,6 @@ class DensityConfig:
 
 
 @config_class
-class DetailConfig:
-    """Settings of the number of Gaussians of the first frame where none is given (see `detail`)."""
-
-    per_detail: Positive = 1.5
-    """Gaussians per detail that the views do not share."""
-    least_gaussians: Count = 4_000
-    """Least number of Gaussians."""
-    most_gaussians: Count = 250_000
-    """Largest number of Gaussians, for memory, the time of later frames and the size of the stream.
-    """
-
-    def __post_init__(self) -> None:
-        if self.least_gaussians > self.most_gaussians:
-            raise ValueError(
-                "DetailConfig(): `least_gaussians` must be 1 to `most_gaussians` = "
-                f"{self.most_gaussians}, got {self.least_gaussians}."
-            )
-
-
-@config_class
 class CameraPriors:
     """Standard deviations of the errors of a calibration, under which its cameras are refined."""
 
@@ -142,8 +126,6 @@ class FitConfig:
     num_gaussians: Count | None = None
     """Number of Gaussians of the first frame; None: from the detail of its images and its time (see
     `budget`). It starts from `first_count`."""
-    detail: DetailConfig = DetailConfig()
-    """Number of Gaussians where none is given."""
     first_frame_steps: Count | None = None
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see
     `budget`).
@@ -222,7 +204,7 @@ class FitConfig:
     @property
     def planned_gaussians(self) -> int:
         """Largest number of Gaussians of the first frame."""
-        return self.detail.most_gaussians if self.num_gaussians is None else self.num_gaussians
+        return MOST_GAUSSIANS if self.num_gaussians is None else self.num_gaussians
 
     @property
     def first_count(self) -> int:

@@ -9,7 +9,6 @@ from annotated_types import Ge, Le
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from morgs_mi.method.motion_model import MOTION_MODELS
-from morgs_mi.method.search import SearchConfig
 from morgs_mi.platform.config import Count, config_class
 
 
@@ -68,8 +67,6 @@ class MotionConfig:
     """Optical flow."""
     masks: MaskConfig = MaskConfig()
     """Motion masks."""
-    search: SearchConfig = SearchConfig()
-    """Coarse search."""
 
     def __post_init__(self) -> None:
         FLOW_SOURCES.check(self.flow_method)

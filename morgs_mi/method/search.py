@@ -20,11 +20,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import gcd
-from typing import Annotated
 
 import cv2
 import numpy as np
-from annotated_types import Gt, Le
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -34,7 +32,6 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.cohesion import NeighbourIndex
 from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
-from morgs_mi.platform.config import NonNegativeInt, config_class
 
 # Steps of the grid from 0 to its end, in each direction of each axis: it has 36,000 places.
 _GRID = 16
@@ -52,19 +49,13 @@ _COST_RATIO = 0.3
 # Error of the images around a part, relative to the error without the displacement, up to which it
 # is accepted.
 _ERROR_RATIO = 0.8
+# Longest displacement along each axis, as a fraction of the image width.
+_REACH = 0.1
+# Most parts of a frame, those with the largest errors first.
+_MAX_PARTS = 3
 
 
-@config_class
-class SearchConfig:
-    """Settings of the coarse search."""
-
-    reach: Annotated[float, Gt(0), Le(1)] = 0.1
-    """Longest displacement along each axis, as a fraction of the image width."""
-    max_parts: NonNegativeInt = 3
-    """Most parts of a frame, those with the largest errors first."""
-
-
-def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConfig) -> MotionStart:
+def search_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """Return a start of the motion in which parts that were not explained move to where they are
     found.
 
@@ -73,18 +64,17 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
     Args:
         problem: N Gaussians, the key views and their images.
         start: of the motion.
-        config: settings.
     """
     displacement = start.displacement
     logit = start.logit_confidence
     gaussians = problem.gaussians
-    parts = _unexplained_parts(problem, displacement, config.max_parts)
+    parts = _unexplained_parts(problem, displacement, _MAX_PARTS)
     surfaces = []
     for first in range(0, len(parts), _COLORS):
-        surfaces += _cost_surfaces(problem, parts[first : first + _COLORS], config.reach)
+        surfaces += _cost_surfaces(problem, parts[first : first + _COLORS])
     for part, part_surfaces in zip(parts, surfaces, strict=True):
         center = np.asarray(gaussians.means)[part].mean(axis=0)
-        d = _best_displacement(center, part_surfaces, config.reach)
+        d = _best_displacement(center, part_surfaces)
         if not d.any():
             continue
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
@@ -129,16 +119,14 @@ def _unexplained_parts(
     return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
 
-def _cost_surfaces(
-    problem: MotionProblem, parts: Sequence[np.ndarray], reach: float
-) -> list[list[_CostSurface]]:
+def _cost_surfaces(problem: MotionProblem, parts: Sequence[np.ndarray]) -> list[list[_CostSurface]]:
     """Return the cost surfaces of each of up to three parts, in the views that show it."""
     surfaces = [[] for _ in parts]
     images = problem.images_around(np.any(parts, axis=0), [])
     if images is None:
         return surfaces
     widest = max(view.camera.width for view in images.views.values())
-    factor = _reduction(widest, images.group.region.block, reach)
+    factor = _reduction(widest, images.group.region.block)
     # The weight of a part is the increase of a pixel if the part is brighter by 1: in red, green or
     # blue.
     sh_coeffs = np.array(problem.gaussians.sh_coeffs)
@@ -161,13 +149,13 @@ def _cost_surfaces(
     return surfaces
 
 
-def _reduction(width: int, block: tuple[int, int], reach: float) -> int:
+def _reduction(width: int, block: tuple[int, int]) -> int:
     """Return the factor by which images are reduced: it divides the sides of a block, and leaves 2
     px per step of the grid, if any does.
     """
     side = gcd(*block)
     return next(
-        f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * width and side % f == 0)
+        f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= _REACH * width and side % f == 0)
     )
 
 
@@ -192,9 +180,7 @@ def _matching_cost(target: np.ndarray, rendering: np.ndarray, weight: np.ndarray
     return np.maximum(cv2.matchTemplate(surroundings, rendering[box], cv2.TM_SQDIFF, mask=mask), 0)
 
 
-def _best_displacement(
-    center: np.ndarray, surfaces: Sequence[_CostSurface], reach: float
-) -> np.ndarray:
+def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface]) -> np.ndarray:
     """Return the displacement d [3] that costs a part around `center` least; 0 if it hardly saves
     anything.
     """
@@ -202,7 +188,7 @@ def _best_displacement(
         return np.zeros(3)
     camera = surfaces[0].camera
     px_per_unit = np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
-    unit = reach * camera.width / _GRID / px_per_unit
+    unit = _REACH * camera.width / _GRID / px_per_unit
     # The whole grid, then quarters of steps around its best.
     axes = [np.arange(-_GRID, _GRID + 1)] * 3
     coarse = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -6,14 +6,22 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.view import View
+from morgs_mi.fit import budget, fit_config
 from morgs_mi.fit.budget import plan_first_frame
-from morgs_mi.fit.fit_config import DensityConfig, DetailConfig, FitConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from tests.scenes.ball import bytes_of, images_of, opaque_ball, views
 
 PIXELS = 64 * 48
-# Images of the ball ask for more Gaussians than the most.
-DETAIL = DetailConfig(per_detail=100.0, least_gaussians=5_000, most_gaussians=50_000)
-CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropout=0.0, density=DensityConfig(rounds=0))
+CONFIG = FitConfig(sh_degree=0, dropout=0.0, density=DensityConfig(rounds=0))
+
+
+@pytest.fixture(autouse=True)
+def limits(monkeypatch):
+    """Let images of the ball ask for more Gaussians than the most."""
+    monkeypatch.setattr(budget, "_PER_DETAIL", 100.0)
+    monkeypatch.setattr(budget, "_LEAST_GAUSSIANS", 5_000)
+    for module in (budget, fit_config):
+        monkeypatch.setattr(module, "MOST_GAUSSIANS", 50_000)
 
 
 def planned(seconds, config=CONFIG):

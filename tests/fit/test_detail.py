@@ -1,18 +1,16 @@
 """The number of Gaussians from the detail of images."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from morgs_mi.core.rig import mean_views
 from morgs_mi.core.view import View
+from morgs_mi.fit import budget
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.detail import count_details
-from morgs_mi.fit.fit_config import DetailConfig, FitConfig
+from morgs_mi.fit.fit_config import FitConfig
 from tests.scenes.cameras import arc, look_at_cameras
 
-CONFIG = DetailConfig(per_detail=1.0, least_gaussians=10, most_gaussians=10**6)
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
 
 
@@ -48,9 +46,15 @@ def test_count_details__counts_valid_pixels_only():
     assert count_details(image, mask) == pytest.approx(count_details(image, None) / 2, rel=0.1)
 
 
-def count(cameras, image, points, config=CONFIG):
+@pytest.fixture(autouse=True)
+def wide_limits(monkeypatch):
+    monkeypatch.setattr(budget, "_PER_DETAIL", 1.0)
+    monkeypatch.setattr(budget, "_LEAST_GAUSSIANS", 10)
+
+
+def count(cameras, image, points):
     """Return the number of Gaussians of views that all show one image."""
-    fit_config = FitConfig(detail=config, first_frame_seconds=1e9)
+    fit_config = FitConfig(first_frame_seconds=1e9)
     views = [View(camera, image) for camera in cameras]
     return plan_first_frame(views, points, fit_config)[0].num_gaussians
 
@@ -66,8 +70,10 @@ def test_plan_first_frame__counts_what_several_views_see_once():
     assert count(beside, image, points) == 2 * one
 
 
-def test_plan_first_frame__stays_within_its_limits():
+def test_plan_first_frame__stays_within_its_limits(monkeypatch):
     cameras = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60)
     image = texture()
-    for limit in ({"least_gaussians": 5000}, {"most_gaussians": 20}):
-        assert count(cameras, image, POINTS, replace(CONFIG, **limit)) == next(iter(limit.values()))
+    for limit, value in (("_LEAST_GAUSSIANS", 5000), ("MOST_GAUSSIANS", 20)):
+        with monkeypatch.context() as context:
+            context.setattr(budget, limit, value)
+            assert count(cameras, image, POINTS) == value

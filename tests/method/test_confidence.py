@@ -41,7 +41,7 @@ def test_motion_mask__passes_its_config_to_threshold_and_refiner():
     observation = observe_key_views({7: FramePair(image, previous)}, "dis", method)[7]
     motion = observation.motion
     reliable = observation.reliable
-    for config in (CONFIG, MaskConfig(floor=20), MaskConfig(working_width=40)):
+    for config in (CONFIG, MaskConfig(floor=20)):
         flow = flow_mask(motion, reliable, config)
         expected = MASK_REFINERS.make(method, config)(image, flow)
         mask = motion_mask(image, motion, reliable, method, config)

@@ -11,7 +11,6 @@ from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.search import (
-    SearchConfig,
     _CostSurface,
     _matching_cost,
     _reduction,
@@ -23,7 +22,6 @@ from tests.scenes.gaussians import isotropic, random_sheet
 from tests.scenes.views import rendered_as
 
 SHIFT = np.float32([0.15, 0.05, 0.08])  # 12 px; the rod is 6 px wide
-CONFIG = SearchConfig()
 ROD = 24
 WALL = 1500
 MOVES = np.arange(ROD + WALL) < ROD
@@ -56,12 +54,12 @@ def start_of(shift=0 * SHIFT, logit=-2):
     )
 
 
-def searched(scene, start, visible=None, config=CONFIG):
+def searched(scene, start, visible=None):
     """Search in the images of the Gaussians that are visible: by default the moved ones."""
     gaussians, views = scene
     seen = rendered_as(moved(gaussians) if visible is None else visible, views)
     problem = MotionProblem(gaussians, seen, np.random.default_rng(0))
-    return search_motion(problem, start, config)
+    return search_motion(problem, start)
 
 
 @pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])
@@ -93,14 +91,6 @@ def test_search_motion__keeps_a_part_that_vanished(scene):
 
 
 @pytest.mark.parametrize(
-    "setting", [{"reach": 0.03}, {"max_parts": 0}], ids=lambda setting: next(iter(setting))
-)
-def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
-    start = start_of()
-    assert searched(scene, start, config=SearchConfig(**setting)) is start
-
-
-@pytest.mark.parametrize(
     ("threshold", "value"),
     [
         ("_UNEXPLAINED", 1e3),
@@ -108,6 +98,8 @@ def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
         ("_MIN_SIZE", ROD + 1),
         ("_COST_RATIO", 0.0),
         ("_ERROR_RATIO", 0.0),
+        ("_REACH", 0.03),
+        ("_MAX_PARTS", 0),
     ],
 )
 def test_search_motion__each_threshold_can_prevent_a_finding(scene, monkeypatch, threshold, value):
@@ -161,4 +153,4 @@ def test_cost_surface__is_the_weighted_squared_difference():
     [(1352, (8, 4), 4), (1352, (4, 2), 2), (700, (8, 4), 2), (160, (8, 4), 1)],
 )
 def test_reduction__leaves_two_pixels_per_step_and_divides_the_blocks(width, block, factor):
-    assert _reduction(width, block, 0.1) == factor
+    assert _reduction(width, block) == factor

@@ -170,11 +170,6 @@ def test_apply_values__replaces_only_what_is_named():
             "[branch.leaf]\ncount = -1",
             "`branch.leaf.count` must not be negative, got -1; take 0.",
         ),
-        (
-            StreamConfig(),
-            "[fit.detail]\nmost_gaussians = 10",
-            "`fit.detail.least_gaussians` must be 1 to `fit.detail.most_gaussians` = 10, got 4000.",
-        ),
     ],
 )
 def test_apply_values__names_file_key_expected_and_given(config, text, message, tmp_path):

@@ -31,9 +31,6 @@ class MaskConfig:
     floor: NonNegative = 0.5
     """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
     proportional to the width, as the motion of a scene is."""
-    working_width: Count = 320
-    """Width in pixels to which GrabCut reduces an image. Its cost grows with the number of pixels,
-    and a mask needs the object's outline, not its details."""
     prompts: Count = 16
     """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
     of the decoder; the smaller ones stay as they are in the flow mask."""

@@ -7,8 +7,11 @@ import numpy as np
 
 from morgs_mi.core.color_space import byte_values
 from morgs_mi.method.exposure import thumbnail
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 
+# Width in pixels to which GrabCut reduces an image. Its cost grows with the number of pixels, and a
+# mask needs the object's outline, not its details.
+_WIDTH = 320
 # Radius in pixels of the opening that removes specks.
 _OPENING = 1
 # Radius of the closing that fills holes, in widths of the mask; at least a pixel.
@@ -21,7 +24,7 @@ _REACH = 0.05
 _COVERAGE = 0.9
 
 
-def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.ndarray:
+def refine_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the mask of the objects [H, W] bool that a motion mask lies on, by GrabCut on colours.
 
     GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004) starts from the mask with specks removed
@@ -32,10 +35,9 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig) -> np.n
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
         mask: [H, W] bool.
-        config: settings of GrabCut.
     """
     clean = clean_mask(mask)
-    small = thumbnail(byte_values(image), config.working_width)
+    small = thumbnail(byte_values(image), _WIDTH)
     seed = cv2.resize(clean.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     near = cv2.dilate(seed, _disc(int(max(seed.shape) * _REACH)))
     if not seed.any() or near.all() or seed.mean() > _COVERAGE:
@@ -68,7 +70,7 @@ def clean_mask(mask: np.ndarray) -> np.ndarray:
 
 
 MASK_REFINERS.register("grabcut")(
-    lambda argument, config: lambda image, mask: mask | refine_mask(image, mask, config)
+    lambda argument, config: lambda image, mask: mask | refine_mask(image, mask)
 )
 
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask, refine_mask
 from tests.method.moving_disc import moving_disc
 
@@ -16,7 +16,7 @@ def test_refine_mask__recovers_an_object_from_a_part_of_it():
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     partial = disc.copy()
     partial[120:140] = False
-    assert iou(refine_mask(image, partial, MaskConfig()), disc) > 0.95 > iou(partial, disc)
+    assert iou(refine_mask(image, partial), disc) > 0.95 > iou(partial, disc)
 
 
 @pytest.mark.parametrize("method", ["none", "grabcut"])
@@ -35,7 +35,7 @@ def test_refine_mask__accepts_any_mask(size):
     masks = {name: np.full(size, name == "all") for name in ("nothing", "speck", "all", "half")}
     masks["speck"][center] = True
     masks["half"][rows < size[0] // 2] = True
-    refined = {name: refine_mask(image, mask, MaskConfig()) for name, mask in masks.items()}
+    refined = {name: refine_mask(image, mask) for name, mask in masks.items()}
     assert {(mask.shape, mask.dtype) for mask in refined.values()} == {(size, np.dtype(bool))}
     assert not refined["nothing"].any()
     assert refined["all"].all()
@@ -49,10 +49,3 @@ def test_clean_mask__removes_specks_and_closes_holes():
     cleaned = clean_mask(mask)
     assert cleaned[52:148, 52:148].all()
     assert not cleaned[:, 250:].any()
-
-
-def test_mask_config__working_width_acts():
-    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
-    mask = np.roll(disc, (25, 19), (0, 1))
-    usual = refine_mask(image, mask, MaskConfig())
-    assert not np.array_equal(refine_mask(image, mask, MaskConfig(working_width=160)), usual)
