@@ -156,7 +156,11 @@ def relative_to(stream: FrameSource) -> str:
 
 @options
 class ExportKind:
-    """A kind of export: options, with `formats` and the method `write` of their writer."""
+    """A kind of export: options, with `formats` and the method `write` of their writer.
+
+    Its option `output` is the file or folder; one called `path` gives it a name. `drawn`: as for
+    `opened`.
+    """
 
     source: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians."""

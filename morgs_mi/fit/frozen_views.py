@@ -34,6 +34,7 @@ from morgs_mi.method.ssim import Comparison
 from morgs_mi.method.ssim_layout import RUN, Lanes, Planes
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.backend import elements, sections
+from morgs_mi.render.channels import channel_sizes
 from morgs_mi.render.padded_region import (
     Packing,
     PaddedRegion,
@@ -416,7 +417,7 @@ def _with_channels(columns: Mapping[str, Any], names: Sequence[str]) -> dict[str
 
 def _no_static(channels: Sequence[str], size: int) -> dict[str, Any]:
     """Return no static splats, in arrays of a size."""
-    widths = {"color": 3, "motion": 2, "guided_motion": 2}
+    widths = channel_sizes()
 
     # Arrays of their own: a recording takes two that share memory for one.
     def zeros(count: int) -> list[Float]:
@@ -429,7 +430,7 @@ def _no_static(channels: Sequence[str], size: int) -> dict[str, Any]:
         "depth": zeros(1)[0],
         "radius": mi.Vector2f(zeros(2)),
         "valid": from_numpy(mi.Bool, np.zeros(size, bool)),
-        "channels": {name: tuple(zeros(widths.get(name, 1))) for name in channels},
+        "channels": {name: tuple(zeros(widths[name])) for name in channels},
     }
 
 

@@ -183,6 +183,7 @@ class Term:
     weight: float | None = None  #: Lambda; None: the setting NAME_weight, 1 without one.
 
 
+# Terms that every fit may have: recorded steps compute them, without `Prediction.extent`.
 TERMS: tuple[Term, ...] = (
     Term(  # eq. 2
         "recon",

@@ -2,7 +2,7 @@
 
 An extra is a folder of `morgs_mi.extras`, or an entry point of the group `morgs_mi.extras` in
 another package. Its function `register` enters places by name; what lies there is imported when it
-is used. Nothing else of the package names an extra, so each folder can be deleted.
+is used. Only the list of public names has names of extras, so each folder can be deleted.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Readers of the supported capture layouts.
 
-A module of this folder exposes its `READER`. Extras enter theirs; a script appends its own to
-`READERS`.
+A layout is a module with a `READER`, which `READERS` lists. Extras enter theirs; a script appends
+its own.
 """
 
 from __future__ import annotations
