@@ -609,7 +609,12 @@ def test_view__ends_on_ctrl_c(clip):
     code = "import sys; from morgs_mi.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "view", str(clip[0]), "--no-browser"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell ignores SIGINT for the processes that it starts in the background.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as server:
         link = next(line for line in server.stdout if "http://" in line)
         assert get(link.split()[0], exact(0, "color", rig()[0]))[0].status == 200
