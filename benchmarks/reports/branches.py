@@ -348,7 +348,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_POINTS, "extent of distant scenes", {"fit.initialise:_DEPTH": 0.0}, True),
     # fit.detail, fit.budget
     Branch(_PLAN, "noise in details", {"fit.detail:_NOISE": 0.0}, True),
-    Branch(_PLAN, "least number of Gaussians", {"fit.budget:_LEAST_GAUSSIANS": 1}, True),
+    Branch(_PLAN, "least number of Gaussians", {"fit.budget:LEAST_GAUSSIANS": 1}, True),
     Branch(_PLAN, "Gaussians that grow in the plan", {"fit.budget:_GROWING": 1.0}, True),
     # Constants of one meaning at one value.
     Branch(_SHARED, "gain of a proposal that does not move", {"method.motion:_ERROR_RATIO": 0.8}),

@@ -33,9 +33,10 @@ from morgs_mi.fit.fit_config import MOST_GAUSSIANS, FitConfig
 from morgs_mi.fit.view import half_sized
 from morgs_mi.platform.memory import check_memory
 
-# Gaussians per detail that the views do not share, and the least number of them.
-_PER_DETAIL = 1.5
-_LEAST_GAUSSIANS = 4_000
+PER_DETAIL = 1.5
+"""Gaussians per detail that the views do not share."""
+LEAST_GAUSSIANS = 4_000
+"""Least number of Gaussians of a first frame whose number is not given."""
 # Seconds of a first frame without a limit, on the reference machine.
 _SECONDS = 120.0
 # Seconds of a step per Gaussian, and per pixel of its view.
@@ -91,9 +92,9 @@ def plan_first_frame(
     if config.num_gaussians is None:
         # The most Gaussians that fit into the time, of those that the images ask for.
         details = sum(count_details(view.image, view.mask) for view in views)
-        count = _PER_DETAIL * details / mean_views([view.camera for view in views], points)
-        most = int(np.clip(round(count), _LEAST_GAUSSIANS, MOST_GAUSSIANS))
-        least = min(max(_LEAST_GAUSSIANS, most // _LEAST_SHARE), most)
+        count = PER_DETAIL * details / mean_views([view.camera for view in views], points)
+        most = int(np.clip(round(count), LEAST_GAUSSIANS, MOST_GAUSSIANS))
+        least = min(max(LEAST_GAUSSIANS, most // _LEAST_SHARE), most)
         too_many = bisect_left(
             range(least + 1, most + 1),
             True,

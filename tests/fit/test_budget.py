@@ -18,8 +18,8 @@ CONFIG = FitConfig(sh_degree=0, dropout=0.0, density=DensityConfig(rounds=0))
 @pytest.fixture(autouse=True)
 def limits(monkeypatch):
     """Let images of the ball ask for more Gaussians than the most."""
-    monkeypatch.setattr(budget, "_PER_DETAIL", 100.0)
-    monkeypatch.setattr(budget, "_LEAST_GAUSSIANS", 5_000)
+    monkeypatch.setattr(budget, "PER_DETAIL", 100.0)
+    monkeypatch.setattr(budget, "LEAST_GAUSSIANS", 5_000)
     for module in (budget, fit_config):
         monkeypatch.setattr(module, "MOST_GAUSSIANS", 50_000)
 

@@ -48,8 +48,8 @@ def test_count_details__counts_valid_pixels_only():
 
 @pytest.fixture(autouse=True)
 def wide_limits(monkeypatch):
-    monkeypatch.setattr(budget, "_PER_DETAIL", 1.0)
-    monkeypatch.setattr(budget, "_LEAST_GAUSSIANS", 10)
+    monkeypatch.setattr(budget, "PER_DETAIL", 1.0)
+    monkeypatch.setattr(budget, "LEAST_GAUSSIANS", 10)
 
 
 def count(cameras, image, points):
@@ -73,7 +73,7 @@ def test_plan_first_frame__counts_what_several_views_see_once():
 def test_plan_first_frame__stays_within_its_limits(monkeypatch):
     cameras = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60)
     image = texture()
-    for limit, value in (("_LEAST_GAUSSIANS", 5000), ("MOST_GAUSSIANS", 20)):
+    for limit, value in (("LEAST_GAUSSIANS", 5000), ("MOST_GAUSSIANS", 20)):
         with monkeypatch.context() as context:
             context.setattr(budget, limit, value)
             assert count(cameras, image, POINTS) == value
