@@ -75,6 +75,7 @@ OLD_OPTIONS = {
     "--front": "is now --camera",
     "--format": "went: the name of the output determines the format",
     "--key-views": "is now `key_views` in `[motion]` of a file of settings (--config)",
+    "--loop": "went: a video is played once; name a longer one",
     "--open-browser": "is now --browser",
     "--no-open-browser": "is now --no-browser",
     "--reproducible": "went: every fit on a CPU is reproducible; leave it out",

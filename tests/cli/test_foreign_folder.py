@@ -45,7 +45,7 @@ LINES = {
     "calibrate": "calibrate capture --overwrite",
     "demo": f"demo demo {SMALL} --config short.toml",
     "import": "import a.ply a.ply imported",
-    "live": "live live --camera capture/cam0.mkv capture/cam1.mkv capture/cam2.mkv --loop "
+    "live": "live live --camera capture/cam0.mkv capture/cam1.mkv capture/cam2.mkv "
     f"--calibration capture --frames 4 --view --no-browser {SHORT}",
     "sweep": "sweep capture --presets default --epochs 1 --seeds 1 --frames 2 --config short.toml",
     "synth": f"synth spheres synth {SMALL}",

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 SMALLER = {
     "synth": "--cameras 7 --frames 3 --width 160 --height 120 --spp 4",
     "fit": "--num-gaussians 1500 --first-frame-steps 60 --epochs 1",
-    "live": "--calibration CAPTURE --frames 2 --loop --first-frame-steps 30 --epochs 1",
+    "live": "--calibration CAPTURE --frames 2 --first-frame-steps 30 --epochs 1",
     "demo": "--frames 3 --cameras 7",
     "render": "--width 240",
 }

@@ -1,4 +1,4 @@
-"""A clip of `filmed` as videos that are played in a loop, and its calibration."""
+"""A clip of `filmed` as long videos, and its calibration."""
 
 from functools import cache
 from unittest.mock import Mock
@@ -12,6 +12,7 @@ from tests.quick import quick
 from tests.scenes import filmed, textured
 
 FPS = 20.0
+REPEATS = 60  # of the clip in a video, which then lasts longer than a fit of a few frames
 NAMES = tuple(camera.name for camera in filmed.rig())
 # Enough for a rough image, and slower than the clip.
 CONFIG = quick(num_gaussians=1500, first_frame_steps=150, epochs=2)
@@ -35,10 +36,10 @@ def write_calibration(path):
 
 
 def write_videos(folder):
-    """Write the clip of each camera as a video and return their paths."""
+    """Write the clip of each camera, many times in succession, as a video; return their paths."""
     paths = [folder / f"{name}.mkv" for name in NAMES]
     for path, clip in zip(paths, clips(), strict=True):
-        write_video(path, clip, FPS)
+        write_video(path, REPEATS * clip, FPS)
     return paths
 
 

@@ -59,7 +59,6 @@ class CameraFeed:
         warm_up: seconds that the cameras have, after the first image of the last of them, to adjust
             their exposure.
         closed: is set when the feed is closed; an iterator that waits ends then.
-        ended: why there are no images any more of a camera that ends without an error.
     """
 
     def __init__(
@@ -68,14 +67,13 @@ class CameraFeed:
         timeout: float,
         warm_up: float = 0.0,
         closed: Event | None = None,
-        ended: str = "it has ended",
     ) -> None:
         self._timeout = timeout
         self._warm_up = warm_up
         self._change = Condition()
         self._stop_event = closed or Event()
         self._cameras = {
-            name: _Camera(images, self._change, self._stop_event, ended)
+            name: _Camera(images, self._change, self._stop_event)
             for name, images in cameras.items()
         }
         # A thread that executes library code when the interpreter ends aborts the process.
@@ -210,9 +208,7 @@ class CameraFeed:
 class _Camera(Thread):
     """Thread that reads the images of a camera; its state is guarded by `changed`."""
 
-    def __init__(
-        self, images: Iterable[np.ndarray | None], change: Condition, stop: Event, end_text: str
-    ) -> None:
+    def __init__(self, images: Iterable[np.ndarray | None], change: Condition, stop: Event) -> None:
         super().__init__(daemon=True, name="camera")
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
         self.reason: str | None = None  # why there are no images any more
@@ -220,7 +216,6 @@ class _Camera(Thread):
         self._images = images
         self._change = change
         self._stop_event = stop
-        self._end_text = end_text
 
     def run(self) -> None:
         """Read until the source ends or the feed is closed."""
@@ -239,5 +234,5 @@ class _Camera(Thread):
         finally:
             close_items(self._images)
             with self._change:
-                self.reason = str(self.error or self._end_text)
+                self.reason = str(self.error or "it has ended")
                 self._change.notify_all()

@@ -16,7 +16,6 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import count
-from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -220,17 +219,14 @@ class _LiveFrames:
         """
         frame_set = self.first
         frame = None
-        end = inf
         for index in count():
             images = map_in_threads(partial(self._processed, frame_set), self.capture.views)
             frame = PartialFrame.of(index, self.capture.views, images, frame)
             yield frame_set, frame
-            end = min(end, time.monotonic() + (self.config.seconds or inf))
             if index + 1 == self.config.frames:
                 return
             if (frame_set := self.feed.newest(frame_set)) is None:
                 _LOG.warning("the fit ends after frame %d: %s", index, self.feed.ended())
-            if frame_set is None or frame_set.time > end:
                 return
 
     def _processed(self, frame_set: FrameSet, view: RecordedView) -> ImageOrError:

@@ -12,7 +12,7 @@ from tyro.conf import arg
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.platform.checks import require
-from morgs_mi.platform.config import Count, Positive, check_ranges
+from morgs_mi.platform.config import Count, check_ranges
 
 # Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and
 # nothing should move during the first frame.
@@ -35,8 +35,6 @@ class LiveConfig:
     """Held-out cameras, by indices or names; by default all are fitted."""
     frames: Count | None = None
     """Number of frames to fit; by default as many as come."""
-    seconds: Positive | None = None
-    """Time in seconds for the frames after the first one; by default until the cameras end."""
     record: bool = True
     """Store the images of all fitted frames; otherwise of the first one alone."""
     fps: Annotated[float, Ge(1e-6), Le(1_000_000)] = 30
@@ -47,8 +45,6 @@ class LiveConfig:
     """Seconds in which the cameras adjust their exposure before the first images are taken; not of
     files.
     """
-    loop: bool = False
-    """Repeat videos until the fit is ended; by default they are played once."""
     size: tuple[int, int] | None = None
     """Width and height of the images that cameras of this machine are asked for; by default they
     choose.

@@ -56,8 +56,8 @@ def open_feed(
         names: names of the cameras; by default cam0, cam1, ...
 
     Raises:
-        ValueError: there is no source, one occurs twice, their number differs from the number of
-            names, or the settings repeat videos and there is none.
+        ValueError: there is no source, one occurs twice, or their number differs from the number of
+            names.
     """
     names = [f"cam{k}" for k in range(len(sources))] if names is None else names
     videos = [source for source in sources if is_video(source)]
@@ -74,20 +74,17 @@ def open_feed(
         text,
         "name them in that order",
     )
-    can_repeat = videos or not config.loop
-    require(can_repeat, place, "`loop` repeats videos", f"none in {text}", "leave it out")
     stop = Event()
     clock = ClipClock(len(videos))
 
     def images(source: Source) -> Iterator[np.ndarray | None]:
         if is_video(source):
-            return play(source, clock, stop, videos.index(source), config.loop)
+            return play(source, clock, stop, videos.index(source))
         return read_camera(source, stop, config.size)
 
-    hint = "; --loop repeats videos" if videos and not config.loop else ""
     cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
     warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
-    return CameraFeed(cameras, config.timeout, warm_up, stop, f"it has ended{hint}")
+    return CameraFeed(cameras, config.timeout, warm_up, stop)
 
 
 def live_frames(
@@ -227,14 +224,9 @@ class ClipClock:
 
     Args:
         clips: their number.
-
-    Attributes:
-        length: time after which the clips are repeated, s: the length of the shortest one, once it
-            has ended.
     """
 
     def __init__(self, clips: int = 1) -> None:
-        self.length = inf
         self._times = [-inf] * clips
         self._start = -inf
         self._change = Condition()
@@ -265,9 +257,7 @@ class ClipClock:
             self._change.notify_all()
 
 
-def play(
-    path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop: bool = False
-) -> Iterator[np.ndarray]:
+def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0) -> Iterator[np.ndarray]:
     """Yield the images of a video, RGB uint8 [H, W, 3], at their times.
 
     Args:
@@ -275,31 +265,16 @@ def play(
         clock: of all clips that are played side by side, each in a thread of its own.
         closed: is set by another thread to end the images.
         clip: index of the video among the clips.
-        loop: whether to begin again, together with the others, when the shortest clip has ended.
 
     Raises:
         OSError: the video cannot be opened.
     """
-    begin = 0.0
     try:
-        while True:
-            images = timed_images(path)
-            following = next(images, None)
-            while following is not None:
-                image, at, interval = following
-                following = next(images, None)
-                if loop and following is None:
-                    # Known before the last image is shown, so that longer clips do not go on.
-                    clock.length = min(clock.length, at + interval)
-                clock.wait(clip, begin + at, interval, closed)
-                if closed.is_set():
-                    return
-                if at > clock.length - interval / 2:
-                    break
-                yield image
-            if not loop:
+        for image, at, interval in timed_images(path):
+            clock.wait(clip, at, interval, closed)
+            if closed.is_set():
                 return
-            begin += clock.length
+            yield image
     finally:
         clock.leave(clip)
 

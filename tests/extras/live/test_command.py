@@ -46,7 +46,7 @@ def test_Live__fits_videos_until_they_end(capture, tmp_path, videos, run, monkey
     )
     assert "Frame 0: 0.0 s after the first, latency " in error
     assert re.search(
-        r"the fit ends after frame \d+: cam0, cam1, cam2: it has ended; --loop repeats videos",
+        r"the fit ends after frame \d+: cam0, cam1, cam2: it has ended",
         caplog.text,
     )
     assert calls == [((out, True), True), None]

@@ -66,7 +66,7 @@ def packets(path):
 def test_fit_live__follows_videos_at_their_speed(tmp_path, rig, videos):
     out = tmp_path / "out"
     grown = []
-    live = LiveConfig(rig, downscale=4, frames=4, loop=True)
+    live = LiveConfig(rig, downscale=4, frames=4)
     rows = fit_live(
         videos, out, live, CONFIG, lambda *_: grown.append(open_stream(out).index()[-1][1])
     )
@@ -129,10 +129,8 @@ def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(tmp_path, rig, v
 
 @pytest.mark.slow
 def test_fit_live__calibrates_the_cameras_once(tmp_path, videos):
-    live = LiveConfig(seconds=1, record=False, loop=True)
-    rows = fit_live(videos, tmp_path / "out", live, CONFIG)
-    assert len(rows) >= 2
-    assert rows[-1].time <= rows[0].latency + 1
+    live = LiveConfig(frames=2, record=False)
+    assert len(fit_live(videos, tmp_path / "out", live, CONFIG)) == 2
     capture = load_capture(tmp_path / "out" / "capture")
     assert capture.names == NAMES
     assert capture.num_frames == 1, "only the first frame is recorded"
@@ -144,7 +142,7 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path, rig
         if row.frame == 1:
             raise KeyboardInterrupt
 
-    live = LiveConfig(rig, downscale=2, loop=True)
+    live = LiveConfig(rig, downscale=2)
     rows = fit_live(videos, tmp_path / "out", live, CONFIG, interrupt)
     assert len(rows) == len(packets(tmp_path / "out")) == 2
     assert open_stream(tmp_path / "out").closed()

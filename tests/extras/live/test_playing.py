@@ -1,7 +1,6 @@
-"""Videos that are played side by side: at their speed, at one time, again and again."""
+"""Videos that are played side by side, at their speed and at one time."""
 
 import time
-from itertools import islice
 from pathlib import Path
 from threading import Event, Thread
 
@@ -25,14 +24,14 @@ def clip(path, count, fps=50):
     return path
 
 
-def played(paths, count, loop):
-    """Return the time and the number [count, 2] of the first images of each clip."""
+def played(paths):
+    """Return the time and the number [n, 2] of the images of each clip."""
     clock = ClipClock(len(paths))
     rows = [[] for _ in paths]
     start = time.monotonic()
 
     def read(k):
-        for image in islice(play(paths[k], clock, Event(), k, loop), count):
+        for image in play(paths[k], clock, Event(), k):
             rows[k].append((time.monotonic() - start, int(image[0, 0, 0]) // 10))
 
     threads = [Thread(target=read, args=(k,), daemon=True) for k in range(len(paths))]
@@ -44,25 +43,12 @@ def played(paths, count, loop):
 
 
 def test_play__plays_a_clip_once_at_its_own_speed(tmp_path):
-    (rows,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
+    (rows,) = played([clip(tmp_path / "a.mkv", 6, fps=20)])
     times, numbers = rows.T
     assert numbers.tolist() == [0, 1, 2, 3, 4, 5]
     assert times[-1] - times[0] >= 5 / 20 - 0.01
     # Not all at once; on a busy machine a late image is followed by the next one.
     assert np.count_nonzero(np.diff(times) > 0.02) >= 3
-
-
-def test_play__repeats_clips_together_after_the_shortest(tmp_path):
-    lengths = ((6, 20), (9, 20), (5, 10))
-    paths = [clip(tmp_path / f"{count}.mkv", count, fps) for count, fps in lengths]
-    times, numbers = np.moveaxis(played(paths, 20, loop=True), 2, 0)
-    assert numbers[0].tolist() == [*range(6)] * 3 + [0, 1]
-    assert numbers[1].tolist() == numbers[0].tolist(), "without its last three"
-    slow = [0, 1, 2] * 6 + [0, 1]
-    assert numbers[2].tolist() == slow, "at half the rate, without its last two"
-    starts = np.stack([time[number == 0][:4] for time, number in zip(times, numbers, strict=True)])
-    # The median, because a busy machine may show one image late.
-    assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.049, "within an interval"
 
 
 def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch):
@@ -72,7 +58,7 @@ def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch):
             yield np.full((2, 2, 3), 10 * k, np.uint8), k / 100, 1 / 100
 
     monkeypatch.setattr(module, "timed_images", timed)
-    slow, fast = played([Path("slow"), Path("fast")], 99, loop=False)
+    slow, fast = played([Path("slow"), Path("fast")])
     assert slow[:, 1].tolist() == fast[:, 1].tolist() == [*range(20)]
     assert (fast[2:, 0] > slow[:-2, 0]).all()
     assert (slow[2:, 0] > fast[:-2, 0]).all()
@@ -83,7 +69,7 @@ def test_play__ends_when_it_is_closed(tmp_path):
     closed = Event()
     reader = Thread(
         target=list,
-        args=(play(clip(tmp_path / "a.mkv", 3), ClipClock(2), closed, loop=True),),
+        args=(play(clip(tmp_path / "a.mkv", 3), ClipClock(2), closed),),
         daemon=True,
     )
     reader.start()
@@ -108,27 +94,14 @@ def test_is_video__is_not_the_description_of_a_stream(tmp_path):
     assert [is_video(source) for source in sources] == [True, False, False, False, False]
 
 
-def test_open_feed__repeats_videos_alone():
-    with pytest.raises(
-        ValueError,
-        match=r"`loop` repeats videos, got none in 2 \(0, rtsp://10.0.0.10/live\); leave it",
-    ):
-        open_feed([0, "rtsp://10.0.0.10/live"], LiveConfig(loop=True))
-
-
-@pytest.mark.parametrize("loop", [False, True])
-def test_open_feed__of_videos_begins_with_their_first_images(tmp_path, loop):
-    feed = open_feed(
-        [clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop)
-    )
+def test_open_feed__of_videos_begins_with_their_first_images_and_ends_with_them(tmp_path):
+    feed = open_feed([clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1))
     try:
         frame_set = first = feed.newest()
         assert max(first.numbers.values()) < 8, "without a time to adjust the exposure"
-        while frame_set is not None and frame_set.numbers["cam0"] < 25:
+        while frame_set is not None:
             frame_set = feed.newest(frame_set)
-        assert (frame_set is None) != loop
-        if frame_set is None:
-            assert feed.ended() == "cam0, cam1: it has ended; --loop repeats videos"
+        assert feed.ended() == "cam0, cam1: it has ended"
     finally:
         feed.close()
 
