@@ -56,7 +56,7 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture
         assert re.search(row, out)
     assert "the poses of cam2 do not fit the images; not checked: cam1." in out
     assert "cam1 not checked: its first image is black, of one colour or missing: cut" in out
-    assert "cam2 does not fit: its images are upside down" in out
+    assert "cam2 does not fit: check its place in the order of the cameras, whether" in out
 
 
 def test_info__says_in_one_sentence_that_a_rig_is_too_wide_to_match(capture, run, monkeypatch):

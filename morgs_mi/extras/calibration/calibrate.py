@@ -16,9 +16,8 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
-from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,10 +34,8 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.timeline import nearest_frames
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.types import Arrays
-from morgs_mi.extras.calibration.checks.mistakes import duplicate_poses
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck
 from morgs_mi.fit.image_points import MAX_ERROR
 from morgs_mi.io.clip_readers import open_clips
@@ -230,19 +227,7 @@ def calibrate(
 def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     """Return the result of each camera from its points in COLMAP's model."""
     images = {Path(image.name).stem: image for image in _registered(model)}
-    checks = {name: _check(name, images.get(name), model) for name in names}
-    cameras = []  # with any intrinsics
-    for name, image in images.items():
-        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-        cameras.append(Camera(np.eye(3), pose, 1, 1, name))
-    for pair in duplicate_poses(cameras):
-        for name, other in permutations(cameras[view].name for view in pair):
-            advice = (
-                f"it has the same pose as {other}: one clip seems to be a copy of the other; "
-                "replace it"
-            )
-            checks[name] = replace(checks[name], fits=False, advice=advice)
-    return tuple(checks.values())
+    return tuple(_check(name, images.get(name), model) for name in names)
 
 
 def _registered(model: Any) -> list[Any]:

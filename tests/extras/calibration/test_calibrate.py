@@ -212,15 +212,12 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path):
 def test_calibrate__prints_a_verdict_per_camera(tmp_path, capsys):
     cameras = textured.rig(4, 240, 180)
     film(tmp_path, cameras)
-    shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
     write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
     assert main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
     printed = capsys.readouterr()
     rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
     assert re.match(r"\d{3} +0\.\d\d +fits", rows["cam0"])
-    assert re.match(r"\d{3} +0\.\d\d +does not fit", rows["cam9"])
     assert re.match(r"0 +- +not checked", rows["other"])
-    assert "cam9 does not fit: it has the same pose as cam1: one clip seems" in printed.err
     assert "other not checked: it could not be registered and has no pose" in printed.err
 
 

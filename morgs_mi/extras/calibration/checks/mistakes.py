@@ -1,4 +1,4 @@
-"""Common mistakes of a calibration, and the poses that would correct them.
+"""Common mistakes in several poses of a calibration, and the cameras that would correct them.
 
 A candidate is a pair of corrected cameras and the description of the mistake. The rig check accepts
 a candidate that explains the matches between the images.
@@ -9,44 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from morgs_mi.capture.layouts import poses_bounds, reader_registry
 from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.rig import central_distances, positions_of
-
-# A camera or the cameras of a rig.
-T = TypeVar("T")
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-_ABOUT_FACE = np.diag([-1.0, 1.0, -1.0, 1.0])
 # Corrects columns right, up of a camera that were read as down, right.
 _UPRIGHT = np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _AXES = {
     "OpenCV": "OpenCV's axes (x right, y down, z forward)",
     "OpenGL": "OpenGL's axes (x right, y up, z backward)",
 }
-# Share of the rig's radius, and entries of a rotation: neighbours of a dense rig differ by far more
-# than this.
-_SAME = 1e-3
-# Rotations of a single wrong pose, and what is wrong with it.
-_UPSIDE_DOWN = (
-    "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
-)
-_SIDEWAYS = (
-    "its pose is turned by 90 degrees about the optical axis: check the order and signs of its axes"
-)
-_CAMERA_MISTAKES = (
-    (_HALF_TURN, _UPSIDE_DOWN),
-    (_UPRIGHT, _SIDEWAYS),
-    (_UPRIGHT.T, _SIDEWAYS),
-    (_ABOUT_FACE, "its pose looks backward: turn it by 180 degrees about its vertical axis"),
-    (_FLIP, "its pose is in other axes, unlike the other cameras: negate its y and z axes"),
-)
 # Every exchange of poses is compared with all matches, so their number is limited.
 _MAX_EXCHANGED = 12
 # Factors of the focal length that are tried, and their step: at a wrong focal length the error has
@@ -55,16 +32,6 @@ _FACTOR_OCTAVES = 2.0
 _FACTOR_STEP = 0.25
 # Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
 _LEAST_FACTOR = 0.1
-
-
-def duplicate_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Return the pairs of cameras with the same pose."""
-    positions = positions_of(cameras)
-    rotations = np.array([camera.rotation for camera in cameras])
-    near = _SAME * central_distances(positions).max()
-    same = np.linalg.norm(positions[:, None] - positions, axis=-1) <= near
-    same &= np.abs(rotations[:, None] - rotations).max(axis=(2, 3)) < _SAME
-    return [(i, j) for i, j in np.argwhere(np.triu(same, 1)).tolist()]
 
 
 def rig_candidates(
@@ -110,36 +77,24 @@ def rig_candidates(
             yield rig, f"the clips of {names}, or their poses, seem to be swapped; exchange them"
 
 
-def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
-    """Yield the corrected camera for each mistake that concerns a single pose."""
-    pose = camera.world_to_camera
-    for rotation, sentence in _CAMERA_MISTAKES:
-        yield replace(camera, viewmat=rotation @ pose), sentence
-    # A turned pose keeps the principal point; a turned image has the opposite one.
-    opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
-    K = np.column_stack([camera.K[:, :2], opposite])
-    yield replace(camera, viewmat=_HALF_TURN @ pose, K=K), _UPSIDE_DOWN
-    yield (
-        replace(camera, viewmat=np.linalg.inv(pose)),
-        "its pose is inverted, the other poses are not: invert it",
-    )
-
-
 def focal_candidates(
-    what: str, scaled: Callable[[float], T], error: Callable[[T], float]
-) -> list[tuple[T, str]]:
-    """Return what a factor from 1/4 to 4 on focal lengths corrects, if the best factor differs from
-    1.
+    cameras: Sequence[Camera], error: Callable[[Sequence[Camera]], float]
+) -> list[tuple[Sequence[Camera], str]]:
+    """Return the cameras with a factor from 1/4 to 4 on all focal lengths, if the best factor
+    differs from 1.
 
     Args:
-        what: start of the sentence on the mistake.
-        scaled: returns what has a factor on its focal lengths.
-        error: error of what is scaled, px.
+        cameras: the rig.
+        error: error of a rig, px.
     """
+
+    def scaled(octaves: float) -> list[Camera]:
+        factors = np.diag([2.0**octaves, 2.0**octaves, 1.0])
+        return [replace(camera, K=camera.K @ factors) for camera in cameras]
 
     def error_of(octaves: float) -> float:
         # The search cannot compare infinite errors.
-        return min(error(scaled(float(2.0**octaves))), 1e9)
+        return min(error(scaled(octaves)), 1e9)
 
     steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
     start = min(steps, key=error_of)
@@ -154,15 +109,11 @@ def focal_candidates(
     if abs(factor - 1) <= _LEAST_FACTOR:
         return []
     sentence = (
-        f"{what} to be wrong by a factor, {factor:.2g} times the given value fits: check the "
-        "image size of the calibration, and whether its field of view is horizontal or vertical"
+        f"the focal lengths of all cameras seem to be wrong by a factor, {factor:.2g} times the "
+        "given value fits: check the image size of the calibration, and whether its field of view "
+        "is horizontal or vertical"
     )
-    return [(scaled(factor), sentence)]
-
-
-def with_focal_factor(camera: Camera, factor: float) -> Camera:
-    """Return the camera with its focal lengths multiplied by `factor`."""
-    return replace(camera, K=camera.K @ np.diag([factor, factor, 1.0]))
+    return [(scaled(minimum.x), sentence)]
 
 
 def _turned(cameras: Sequence[Camera], rotation: np.ndarray) -> list[Camera]:

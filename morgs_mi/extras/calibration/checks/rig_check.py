@@ -1,15 +1,14 @@
 """Check of the camera poses against feature matches that are found without the poses.
 
 A camera fits if most of its matches with other fitting cameras have a small reprojection error. If
-a pose does not fit, the common mistakes of `mistakes` are tried. The check reports the mistake that
-explains the matches. Pixels refer to the recorded size, as in `capture.points`.
+several poses do not fit, the common mistakes of `mistakes` are tried. The check reports the mistake
+that explains the matches. Pixels refer to the recorded size, as in `capture.points`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -19,22 +18,17 @@ from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.checks.mistakes import (
-    camera_candidates,
-    duplicate_poses,
     focal_candidates,
     rig_candidates,
-    with_focal_factor,
 )
 from morgs_mi.fit.features import Match, detect, match_views, reprojection_errors
 from morgs_mi.fit.image_points import MAX_ERROR
 
 # With a wrong pose a few matches may fit by chance, but not this many.
 _MIN_MATCHES = 50
-# px. Features of two cameras at different places are farther apart.
-_SAME_IMAGE = 0.5
-# A correction must lower the error by this factor, and to less than twice the error of the poses
-# that fit or to this many pixels: among many candidates, a wrong one may be slightly better than
-# the given poses.
+# A correction must lower the error by this factor: among many candidates, a wrong one may be
+# slightly better than the given poses. Poses with an error below this are in the right order and
+# axes, px.
 _GAIN = 8.0
 _GOOD_ERROR = 0.5
 # Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not
@@ -48,6 +42,10 @@ _LEAST_WIDTH = 160
 _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the "
     "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
+)
+_WRONG_POSE = (
+    "check its place in the order of the cameras, whether its images are turned, its axes and the "
+    "image size of the calibration, or calibrate again (morgs-mi calibrate)"
 )
 _NO_FEATURES = (
     "its first image is black, of one colour or missing: cut such frames off the recording, or "
@@ -111,7 +109,7 @@ def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures
     errors = np.concatenate([np.zeros(0), *pairs.errors])
     # Of so few matches, a wrong correction explains enough by chance.
     has_many = 2 * len(errors) >= _MIN_MATCHES * len(checks)
-    correction = _correct_rig(layout, pairs.sampled(), checks) if has_many else None
+    correction = _correct_rig(layout, pairs.sampled()) if has_many else None
     if correction:
         corrected, explanation = correction
         # The views with another corrected camera are wrong.
@@ -123,11 +121,6 @@ def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures
                 checks[view] = replace(checks[view], fits=False, advice="")
         advice = f"the poses do not fit the images: {explanation}."
     else:
-        checks = _with_copies(checks, pairs)
-        for view, check in enumerate(checks):
-            if check.fits is False and not check.advice:
-                reason = _explain_camera(view, check, pairs.sampled(), group)
-                checks[view] = replace(check, advice=reason)
         wrong = ", ".join(c.name for c in checks if c.fits is False)
         not_checked = ", ".join(c.name for c in checks if c.fits is None)
         count = sum(c.fits is True for c in checks)
@@ -167,31 +160,6 @@ def pose_problems(views: Sequence[View]) -> list[str]:
     return [f"{check.advice.rstrip('.')}; {order}."] if check.fits is False else []
 
 
-def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
-    """Return the results with the reasons for cameras with the pose or the clip of another one."""
-    reasons: dict[int, str] = {}
-    for pair in duplicate_poses(pairs.cameras):
-        # If one of the two fits, the pose is its own.
-        for view in [view for view in pair if not checks[view].fits] or pair:
-            reasons.setdefault(
-                view,
-                f"it has the same pose as {checks[sum(pair) - view].name}: give each camera its "
-                "own, or leave the copy out (--exclude)",
-            )
-    results = list(checks)
-    for view, advice in reasons.items():
-        results[view] = replace(results[view], fits=False, advice=advice)
-    for match in pairs.shared.matches:
-        a, b = match.pixels(pairs.shared.features)
-        if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
-            for view in match.views:
-                if view in reasons or not checks[view].fits:
-                    other = checks[sum(match.views) - view].name
-                    advice = f"its clip is a copy of the clip of {other}; replace one of them"
-                    results[view] = replace(results[view], fits=False, advice=advice)
-    return results
-
-
 @dataclass(frozen=True)
 class _Pairs:
     """Reprojection errors of all pairs of views with matches."""
@@ -210,12 +178,6 @@ class _Pairs:
         pairs = zip(self.shared.matches, self.errors, strict=True)
         parts = [errors for match, errors in pairs if _is_shared(match, view, partners)]
         return np.concatenate([np.zeros(0), *parts])
-
-    def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
-        """Return the median error of a view's matches with `partners` for another camera, px."""
-        matches = tuple(m for m in self.shared.matches if _is_shared(m, view, partners))
-        cameras = [camera if i == view else c for i, c in enumerate(self.cameras)]
-        return _median(_Pairs.of(replace(self.shared, matches=matches), cameras).of_view(view))
 
     def sampled(self, max_pairs: int | None = None) -> _Pairs:
         """Return the errors of a part of each pair's matches, for the `max_pairs` pairs with the
@@ -260,7 +222,7 @@ def _median(errors: np.ndarray) -> float:
 
 
 def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
-    """Return the result of a view; its advice is empty if the pose does not fit."""
+    """Return the result of a view."""
     all_errors = errors = pairs.of_view(view)
     advice = ""
     if len(in_group := pairs.of_view(view, group)):
@@ -275,12 +237,12 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
         advice = _NO_FEATURES
     error = _median(errors)
     fits = None if advice else error <= MAX_ERROR
+    if fits is False:
+        advice = _WRONG_POSE
     return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)
 
 
-def _correct_rig(
-    layout: str, pairs: _Pairs, checks: Sequence[CameraCheck]
-) -> tuple[Sequence[Camera], str] | None:
+def _correct_rig(layout: str, pairs: _Pairs) -> tuple[Sequence[Camera], str] | None:
     """Return the cameras corrected for a mistake in several poses, and its description; None if
     none explains all.
     """
@@ -288,36 +250,10 @@ def _correct_rig(
     # The pairs with the most matches determine a factor on all focal lengths.
     largest = pairs.sampled(_FACTOR_PAIRS).shared
     candidates = focal_candidates(
-        "the focal lengths of all cameras seem",
-        lambda factor: [with_focal_factor(camera, factor) for camera in pairs.cameras],
-        lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
+        pairs.cameras, lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors))
     )
     if error > _GOOD_ERROR:
         candidates = [*rig_candidates(pairs.cameras, layout), *candidates]
     errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
     if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
         return candidates[int(np.argmin(errors))]
-
-
-def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
-    """Return the common mistake that explains the matches of a view, and a remedy."""
-    # Without views that agree, a correction can only be compared with all others.
-    partners = group or set(range(len(pairs.cameras)))
-    error_of = partial(pairs.of_replaced, view, partners=partners)
-    camera = pairs.cameras[view]
-    factors = focal_candidates(
-        "its focal length seems", lambda factor: with_focal_factor(camera, factor), error_of
-    )
-    candidates = [*camera_candidates(camera), *factors]
-    best, sentence = min(candidates, key=lambda candidate: error_of(candidate[0]))
-    of_group = [_median(pairs.of_view(view, group)) for view in group]
-    good = max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
-    if error_of(best) <= min(check.error / _GAIN, MAX_ERROR, good):
-        return sentence
-    cause = "no common mistake explains it"
-    if np.isinf(check.error):
-        cause = "the points in its images lie behind it, so it looks away from them"
-    return (
-        f"{cause}: check its place in the order of the cameras, its axes and the image size of "
-        "the calibration, or calibrate again (morgs-mi calibrate)"
-    )
