@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from benchmarks.field.shared import summed_motion
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModelFactory
-from morgs_mi.playback.export.clips import equal_cells, z_order
+from morgs_mi.playback.export.clips import z_order
 
 # Gaussians per anchor of each level, m r^l.
 _COUNTS = (4, 12, 36)
@@ -44,7 +44,7 @@ def anchor_matrix(points: np.ndarray) -> csr_array:
 
     Anchors are points at equal distances along a Z-order curve through all of them.
     """
-    order = np.argsort(z_order(points, equal_cells(points)), kind="stable")
+    order = np.argsort(z_order(points), kind="stable")
     levels = []
     for count in _COUNTS:
         anchors = points[order[min(count, len(points)) // 2 :: count]]

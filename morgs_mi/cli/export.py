@@ -12,7 +12,6 @@ from tyro.conf import Positional, arg
 from morgs_mi.cli.settings import (
     ChannelName,
     DisplayExposure,
-    Flag,
     one_command,
     optional,
     options,
@@ -83,8 +82,6 @@ class Flight(ExportKind):
     least_seconds: float = 5.0
     """Least duration without SECONDS; a shorter clip is played several times, as a whole. 0: once.
     """
-    back_and_forth: Flag = False
-    """Play every second time backwards, instead of restarting at the first frame."""
     degrees: float | None = None
     """Angle of an orbit, 1 to 360; below 360 the camera swings to both sides. By default the extent
     of the rig.
@@ -125,7 +122,7 @@ class Flight(ExportKind):
         path = path if self.width is None else path.with_width(self.width)
         path = path if self.seconds is None else path.with_duration(self.seconds)
         count = num_images(stream, path)
-        frames = repeated_frames(stream, self.freeze, self.back_and_forth)
+        frames = repeated_frames(stream, self.freeze)
         write_images(
             flight(stream, path, self.channels, frames),
             stream.fps,

@@ -69,6 +69,7 @@ COMMANDS = {
 # Options that went, and what to do instead.
 OLD_OPTIONS = {
     "--animation": "went: scene files pose meshes by functions of the time, see the page on scenes",
+    "--back-and-forth": "went: play a video backwards by another program",
     "--color": "went: --exposure balances the cameras",
     "--completion": "is now --tyro-write-completion bash FILE",
     "--deep": "went: `info` checks the poses, and --time finds the time offsets",

@@ -58,9 +58,9 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write Gaussians as a compressed PLY file in their order, atomically.
 
     The precision of the positions depends on the extent of each 256 successive Gaussians, so they
-    should be ordered by place (see `morgs_mi.playback.export.clips.by_place`). Logarithms of scales
-    beyond -20 to 20 and SH coefficients of degree 1 to 3 beyond -4 to 4 are clipped. Motion and
-    confidence are not written.
+    should be ordered by place (see `morgs_mi.playback.export.clips.in_z_order`). Logarithms of
+    scales beyond -20 to 20 and SH coefficients of degree 1 to 3 beyond -4 to 4 are clipped. Motion
+    and confidence are not written.
 
     Raises:
         OSError: the file cannot be written.

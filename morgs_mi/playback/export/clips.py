@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, repeat
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.frame_source import FrameSource, FrameState, play
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import moved
 from morgs_mi.core.types import Arrays
@@ -71,51 +71,31 @@ def select_frames(stream: FrameSource, frames: str | None) -> list[int]:
     )
 
 
-def by_place(stream: FrameSource) -> Iterator[tuple[int, Gaussians]]:
-    """Yield (frame, Gaussians) like `play`, with the Gaussians along a Z-order curve of the places
-    of their births.
-
-    Neighbours on the curve are neighbours in space and mostly move together. As the place of the
-    birth does not change, Gaussians that live in two frames have the same order in both.
-
-    Raises:
-        ValueError: a broken packet.
+def in_z_order(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians along a Z-order curve of their centres: neighbours on it are neighbours in
+    space.
     """
-    all_ids = np.zeros(0, np.int64)
-    all_keys = np.zeros(0, np.int64)
-    cells = None
-    for state in stream.states():
-        ids = state.lasting_ids
-        means = state.gaussians.numpy()["means"]
-        if len(ids) and (cells is None or not np.isin(ids, all_ids).any()):
-            cells = equal_cells(means)
-        births = ~np.isin(ids, all_ids)
-        if cells is not None and births.any():
-            all_ids = np.concatenate([all_ids, ids[births]])
-            all_keys = np.concatenate([all_keys, z_order(means[births], cells)])
-        keys = all_keys[np.searchsorted(all_ids, ids)]
-        yield state.frame, state.gaussians.select(np.argsort(keys, kind="stable"))
+    return gaussians.select(np.argsort(z_order(gaussians.numpy()["means"]), kind="stable"))
 
 
-def equal_cells(points: np.ndarray) -> np.ndarray:
-    """Return the inner bounds [1023, 3] of cells with equal numbers of points [N, 3] along each
-    axis.
+def z_order(points: np.ndarray) -> np.ndarray:
+    """Return the places int64 [N] of points [N, 3] on a Z-order curve.
 
-    Unlike cells of equal size, they are not widened by far points.
+    The cells of its grid have equal numbers of points along each axis. Unlike cells of equal size,
+    they are not widened by far points.
     """
-    return np.quantile(points, np.linspace(0, 1, 2**_CELL_BITS + 1)[1:-1], axis=0)
-
-
-def z_order(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Return the places int64 [N] of points [N, 3] on a Z-order curve through a grid with the inner
-    bounds `cells`.
-    """
+    ranks = points.argsort(axis=0).argsort(axis=0)
+    cells = (ranks << _CELL_BITS) // max(1, len(points))
     keys = np.zeros(len(points), np.int64)
     for axis in range(3):
-        index = np.searchsorted(cells[:, axis], points[:, axis])
         for bit in range(_CELL_BITS):
-            keys |= (index >> bit & 1) << (3 * bit + axis)
+            keys |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
     return keys
+
+
+def write_ordered_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians as a compressed PLY file along a Z-order curve."""
+    write_compressed_ply(path, in_z_order(gaussians))
 
 
 def write_ply_files(
@@ -126,10 +106,8 @@ def write_ply_files(
     progress: StepReport,
 ) -> None:
     """Write frames of a stream as PLY files of a format in `PLY`, see `write_each`."""
-    is_compressed = kind.name == "compressed.ply"
-    clip = by_place(stream) if is_compressed else play(stream)
-    write = write_compressed_ply if is_compressed else write_ply
-    write_each(clip, output, f".{kind.name}", write, frames, progress)
+    write = write_ordered_ply if kind.name == "compressed.ply" else write_ply
+    write_each(play(stream), output, f".{kind.name}", write, frames, progress)
 
 
 def write_each(
@@ -144,7 +122,7 @@ def write_each(
     atomically.
 
     Args:
-        clip: (frame, Gaussians) of all frames, as `play` and `by_place` yield them.
+        clip: (frame, Gaussians) of all frames, as `play` yields them.
         output: a folder that does not exist, or for one frame a file with a name that ends in
             `suffix`.
         suffix: of the files, e.g. ``.ply``.
@@ -239,39 +217,17 @@ def named_path(
     return replace(path, keys=moved(path.keys, origin))
 
 
-def repeated_frames(
-    stream: FrameSource, freeze: int | None = None, back_and_forth: bool = False
-) -> Iterator[Gaussians]:
+def repeated_frames(stream: FrameSource, freeze: int | None = None) -> Iterator[Gaussians]:
     """Yield the frames of a stream without end.
 
     Args:
         stream: the file.
         freeze: index of a single frame to yield; None: all.
-        back_and_forth: go backwards after the last frame. Motion is then the one of the clip,
-            opposite to the motion that is shown.
 
     Raises:
         ValueError: the stream has no such frame, or a packet is broken.
     """
-    frozen = None if freeze is None else stream.seek(freeze).gaussians
+    if freeze is not None:
+        yield from repeat(stream.seek(freeze).gaussians)
     while True:
-        yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))
-        if frozen is None and back_and_forth:
-            yield from _frames_backwards(stream)
-
-
-def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
-    """Yield the frames between the first and the last one backwards, decoded from one keyframe to
-    the next.
-    """
-    inner_frames = frame_numbers(stream)[1:-1]
-    while inner_frames:
-        # The frames from which the last one is decoded, and that one.
-        block: list[FrameState] = []
-        for state in stream.states(inner_frames[-1]):
-            block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
-            if state.frame == inner_frames[-1]:
-                break
-        # A keyframe has no motion of its own: it follows from the residual, in the block before.
-        yield from (state.gaussians for state in block[:0:-1])
-        inner_frames = [frame for frame in inner_frames if frame <= block[0].frame]
+        yield from (gaussians for _, gaussians in play(stream))
