@@ -18,11 +18,10 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     SpinnerColumn,
-    Task,
     TaskID,
     TextColumn,
+    TimeRemainingColumn,
 )
 from rich.table import Table
 from rich.text import Text
@@ -32,6 +31,7 @@ from morgs_mi.platform.progress import Report, duration, name_of, time_left
 STDOUT = "standard output"
 """Name of standard output in errors."""
 _PERIOD = 30.0  # seconds between two lines of progress without a terminal
+_PACE = 3600.0  # seconds from whose steps a bar estimates the time left: a step may take minutes
 
 
 def printable(text: str) -> str:
@@ -162,10 +162,10 @@ def progress() -> Iterator[Report]:
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
-        _Time(),
+        TimeRemainingColumn(elapsed_when_finished=True),
     )
     tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=ERR) as bars:
+    with Progress(*columns, console=ERR, speed_estimate_period=_PACE) as bars:
 
         def end_stages() -> None:
             for task in tasks.values():  # a stage may end before its last step
@@ -176,21 +176,10 @@ def progress() -> Iterator[Report]:
             if name not in tasks:
                 end_stages()
                 tasks[name] = bars.add_task(stage, total=total, completed=int(done))
-                bars.update(tasks[name], base=bars.tasks[tasks[name]].percentage)
             bars.update(tasks[name], description=stage, completed=done, total=total)
 
         yield report
         end_stages()
-
-
-class _Time(ProgressColumn):
-    """The time that a stage still takes, or has taken."""
-
-    def render(self, task: Task) -> Text:
-        """Return the time in words."""
-        seconds = task.finished_time or task.elapsed or 0
-        left = time_left(seconds, task.percentage, 100, task.fields.get("base", 0))
-        return Text(f"about {duration(left)} left" if left else duration(seconds))
 
 
 def _line_report() -> Report:

@@ -18,6 +18,7 @@ from morgs_mi.cli.settings import (
     options,
 )
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
+from morgs_mi.platform.checks import few
 from morgs_mi.runs.fit_files import FILES
 
 
@@ -43,7 +44,6 @@ class Eval:
         from morgs_mi.evaluate.lpips import Lpips
         from morgs_mi.platform.environment import machine, versions
         from morgs_mi.platform.files import json_finite, write_json
-        from morgs_mi.playback.streams import spans
 
         folder = self.source if self.source.is_dir() else self.source.parent
         files_of_fit = [
@@ -71,7 +71,7 @@ class Eval:
             print_result(sentence)
         if result.without_images:
             print_warning(
-                f"{result.stream}: frames {spans(result.without_images)} were fitted without any "
+                f"{result.stream}: frames {few(result.without_images)} were fitted without any "
                 "image, or have none to compare with; fit them again."
             )
         if not result.complete:

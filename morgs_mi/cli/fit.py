@@ -138,21 +138,12 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
 
 def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
     """Yield the sentences about the views in the report of the first frame."""
-    refined = validation.get("refinement", {})
-    if refined:
-        yield refined["sentence"]
-    if "held_out" in refined:
-        psnr = refined["held_out"]
-        yield (
-            f"Held-out views have {psnr['calibrated_psnr']:.1f} dB as calibrated, "
-            f"{psnr['registered_psnr']:.1f} dB registered."
-        )
-    if "exposure" in validation:
-        yield validation["exposure"]["sentence"]
-    if "sentence" in validation:
-        yield validation["sentence"]
-    if "draft" in validation:
-        yield validation["draft"]["sentence"]
+    refinement = validation.get("refinement", {})
+    held_out = refinement.get("held_out", {})
+    others = (validation.get("exposure", {}), validation, validation.get("draft", {}))
+    for part in (refinement, held_out, *others):
+        if "sentence" in part:
+            yield part["sentence"]
 
 
 @contextmanager

@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import shlex
 import shutil
 import sys
 import textwrap
@@ -155,12 +154,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             _drop_output()
             return _CLOSED
         sentence = "Interrupted." if is_interruption(error) else sentence_of(error)
-        # In the notes of an error, `--resume` is the command line that continues.
-        resume = [] if "--resume" in args else ["--resume"]
-        command_line = shlex.join([prog, *args, *resume])
-        notes = getattr(error, "__notes__", [])
-        notes = [note.replace("`--resume`", f"`{command_line}`") for note in notes]
-        print_warning(" ".join([sentence, *notes]))
+        print_warning(" ".join([sentence, *getattr(error, "__notes__", [])]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:
             ERR.print_exception()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import options
-from morgs_mi.platform.progress import Progress, Report, duration
+from morgs_mi.platform.progress import Report
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.formats import Format, destination
 
@@ -116,24 +115,12 @@ def print_between(stream: FrameSource) -> None:
 
 
 def rendering(report: Report, count: int) -> Callable[[int], None]:
-    """Return the function that is called with the number of images done, of `count`.
-
-    What all take is forecast from the second and third image, because the first one may wait for
-    the compiler.
-    """
-    stage = Progress(report, "Rendering")
-    stage(0, count)
-    begin = time.monotonic()
+    """Return the function that is called with the number of images done, of `count`."""
 
     def show(done: int) -> None:
-        nonlocal stage, begin
-        if done == 1:
-            begin = time.monotonic()
-        elif done == 3:
-            seconds = (time.monotonic() - begin) / 2 * count
-            stage = stage.forecast("Rendering", f", {count} images in about {duration(seconds)}")
-        stage(done, count)
+        report("Rendering", done, count)
 
+    show(0)
     return show
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -155,7 +154,7 @@ def open_stream(
     stream = PlayableStream(path, skip_damaged)
     problems = []
     if stream.skipped:
-        problems.append(f"the damaged frames {spans(stream.skipped)} are skipped")
+        problems.append(f"the damaged frames {few(stream.skipped)} are skipped")
     if skip_damaged and not stream.closed():
         problems.append(
             f"it ends after {quantity(len(stream.index()), 'packet')} without an index, and may "
@@ -164,12 +163,3 @@ def open_stream(
     if problems:
         _LOG.warning("%s: %s.", stream.path, "; ".join(problems))
     return stream
-
-
-def spans(numbers: Sequence[int]) -> str:
-    """Return ascending numbers as text, such as ``0 to 3, 7``."""
-    parts = []
-    for _, group in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
-        first, *others = (number for _, number in group)
-        parts.append(f"{first} to {others[-1]}" if others else f"{first}")
-    return ", ".join(parts)

@@ -20,7 +20,6 @@ from morgs_mi.cli.console import (
     progress,
     sentence_of,
 )
-from morgs_mi.cli.streams import rendering
 
 
 def test_progress__prints_a_line_every_30_seconds_without_a_terminal(capsys, monkeypatch):
@@ -37,19 +36,6 @@ def test_progress__prints_a_line_every_30_seconds_without_a_terminal(capsys, mon
         "Fitting frames: 9/12, 2 min elapsed, about 30 s left.",
         "Fitting frames: 12/12, 2 min elapsed, about 0 s left.",
     ]
-
-
-def test_rendering__forecasts_from_the_second_and_third_image(monkeypatch):
-    clock = 1000.0
-    monkeypatch.setattr(time, "monotonic", lambda: clock)
-    stages = []
-    show = rendering(lambda *state: stages.append(state), 150)
-    for done, seconds in enumerate((60.0, 0.3, 0.1, 0.2, 0.2), start=1):
-        clock += seconds
-        show(done)
-    forecast = "Rendering, 150 images in about 30 s"
-    names = ["Rendering", "Rendering", "Rendering", forecast, forecast, "Rendering"]
-    assert stages == [(name, done, 150) for done, name in enumerate(names)]
 
 
 def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(capsys, monkeypatch):

@@ -104,7 +104,7 @@ def test_render__skips_damaged_frames_when_asked(tmp_path, run, caplog):
         "0000.png",
         *(f"000{k}.png" for k in (3, 4, 5)),
     ]
-    assert caplog.messages == [f"{path}: the damaged frames 1 to 2 are skipped."]
+    assert caplog.messages == [f"{path}: the damaged frames 1, 2 are skipped."]
 
 
 def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(stream, tmp_path, run, caplog):

@@ -126,8 +126,8 @@ class Refinement:
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
     ) -> JsonObject:
-        """Return the result with its sentence, and the PSNR of the held-out views, if there are
-        any.
+        """Return the result with its sentence, and the PSNR of the held-out views with a sentence,
+        if there are any.
 
         The PSNR is the mean over these views, in dB: once with the calibrated cameras, once with
         registered ones.
@@ -151,8 +151,14 @@ class Refinement:
             for view in views
         ]
         rigs = {"calibrated_psnr": views, "registered_psnr": registered}
-        scores = {name: mean_psnr(gaussians, rig, config.render) for name, rig in rigs.items()}
-        return result | {"held_out": scores}
+        held_out: JsonObject = {
+            name: mean_psnr(gaussians, rig, config.render) for name, rig in rigs.items()
+        }
+        held_out["sentence"] = (
+            f"Held-out views have {held_out['calibrated_psnr']:.1f} dB as calibrated, "
+            f"{held_out['registered_psnr']:.1f} dB registered."
+        )
+        return result | {"held_out": held_out}
 
 
 def refine_cameras(
