@@ -65,21 +65,6 @@ class Forecast:
         )
 
     @property
-    def is_wide(self) -> bool:
-        """Whether the angles between the cameras alone make such views poor."""
-        return self.spacing > _FAIR
-
-    @property
-    def unmatched_sentence(self) -> str:
-        """The quality of a rig whose images do not match because it is wide."""
-        return (
-            f"{self.cameras} cameras, {self.spacing:.0f} degrees apart, are too far from each "
-            "other to match their images: poses are not checked, and views between the cameras "
-            f"will be {self.quality}; with {self._more} more on an arc, at most {int(_GOOD)} "
-            "degrees apart, they would be good."
-        )
-
-    @property
     def _more(self) -> int:
         """Number of further cameras that would make views good."""
         return ceil((self.cameras - 1) * (self.spacing / _GOOD - 1))

@@ -54,13 +54,12 @@ _COLUMNS = (
     "error, px",
     "pose",
 )
-# Standard errors in frames above which a time offset is uncertain, and from which it counts as not
-# found.
-_UNCERTAIN = 0.1
+# Standard error in frames from which a time offset counts as not found.
 _NOT_FOUND = 0.5
-_UNCERTAIN_WHY = (
-    "Their images hardly depend on the clocks: little moves, or in a direction in which an offset "
-    "looks like a change of depth, or the cameras are far apart."
+_ABOUT_CLOCKS = (
+    "Offsets with errors above 0.1 are uncertain, and from 0.5 not found: the images hardly depend "
+    "on the clocks, because little moves, or in a direction in which an offset looks like a change "
+    "of depth, or the cameras are far apart."
 )
 
 
@@ -102,11 +101,7 @@ class Info:
         train_cameras = capture.views.train.cameras
         if len(train_cameras) > 1:
             views = forecast(train_cameras, capture.points)
-            sentence = views.sentence
-            if views.is_wide and rig_check is not None and rig_check.unmatched:
-                sentence = views.unmatched_sentence  # which says all that the check would
-                rig_check = None
-            print_result(sentence, _STYLES[views.quality])
+            print_result(views.sentence, _STYLES[views.quality])
         if rig_check is not None:
             error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
             print_result(
@@ -127,8 +122,7 @@ class Info:
         if self.time:
             with progress() as report:
                 offsets = estimate_time_offsets(capture, partial(report, "Comparing clocks"))
-            for line in _time_lines(offsets):
-                print_result(line)
+            _print_clocks(offsets)
         if self.plot is not None:
             write_rig(self.plot, capture)
             print_result(f"Plot of the rig: {self.plot}")
@@ -212,30 +206,25 @@ def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
     return table
 
 
-def _time_lines(offsets: TimeOffsets) -> list[str]:
-    """Return the time offsets as the options that align the clips, and how certain they are."""
-    errors = {name: error for name, error in offsets.errors.items() if name != offsets.reference}
-    measured_errors = {name: error for name, error in errors.items() if error < _NOT_FOUND}
-    lines = []
-    if measured_errors:
-        options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in measured_errors)
-        worst = max(measured_errors, key=lambda name: measured_errors[name])
-        lines = [
-            f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
-            f"Standard errors of these offsets: up to {errors[worst]:.2f} frames ({worst}).",
-        ]
-    doubts = [f"{name} ({e:.2f})" for name, e in measured_errors.items() if e > _UNCERTAIN]
-    if doubts:
-        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
-    if len(measured_errors) < len(errors):
-        names = ", ".join(name for name in errors if name not in measured_errors)
-        lines.append(f"Clocks not found: {names}; keep what is known of them. {_UNCERTAIN_WHY}")
+def _print_clocks(offsets: TimeOffsets) -> None:
+    """Print the time offsets with their errors, and the option that aligns the clips."""
+    table = _check_table("Clocks", ("camera", "offset, frames", "standard error"))
+    for name, error in offsets.errors.items():
+        table.add_row(name, f"{offsets.offsets[name]:.2f}", f"{error:.2f}")
+    print_table(table)
+    option = " ".join(
+        f"{name} {offsets.offsets[name]:.2f}"
+        for name, error in offsets.errors.items()
+        if name != offsets.reference and error < _NOT_FOUND
+    )
+    if option:
+        print_result(f"Pass --offset {option} for the time of {offsets.reference}.")
+    print_result(_ABOUT_CLOCKS)
     if not offsets.converged:
-        lines.append(
+        print_result(
             f"The offsets still change by {offsets.change:.2f} frames: the clips may not show "
             "enough."
         )
-    return lines
 
 
 def _check_table(title: str, columns: Sequence[str]) -> Table:

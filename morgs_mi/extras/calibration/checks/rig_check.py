@@ -84,11 +84,6 @@ class RigCheck:
     fits: bool | None
     advice: str  #: One sentence with the result, and the remedy if it is the same for all cameras.
 
-    @property
-    def unmatched(self) -> bool:
-        """Whether all images show something, but none has enough matches with others."""
-        return all(check.advice.endswith(_NO_OVERLAP) for check in self.cameras)
-
 
 def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return the result of checking the capture's cameras against the matches between its views."""

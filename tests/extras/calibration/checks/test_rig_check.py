@@ -47,12 +47,6 @@ def test_check_rig__does_not_check_a_camera_without_matches(capture, shared):
     )
 
 
-def test_check_rig__is_unmatched_without_any_match(capture, shared):
-    none = check_rig(capture, SharedFeatures(shared.features, ()))
-    assert none.unmatched
-    assert not check_rig(capture, shared).unmatched
-
-
 def test_check_rig__names_a_first_image_that_is_black(capture, shared):
     features = tuple(f if v != 3 else detect(None) for v, f in enumerate(shared.features))
     others = tuple(match for match in shared.matches if 3 not in match.views)
