@@ -75,8 +75,8 @@ def fitted_clip(tmp_path_factory):
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])
     tracks = Tracks(corners[:, None] + steps, np.zeros(3, np.int32), {})
     save_tracks(capture / "truth", tracks)
-    metadata = {"capture": str(capture), "downscale": 1, "test_view": 0}
-    write_stream(folder / "stream.morgs", metadata)
+    write_stream(folder / "stream.morgs", {"downscale": 1, "test_view": 0})
+    (folder / "capture.json").write_text(json.dumps({"capture": str(capture)}))
     rows = [{"frame": t, "seconds": 3.0 - t} for t in range(FRAMES)]
     (folder / "report.json").write_text(json.dumps({"frames": rows}))
     return folder

@@ -233,22 +233,19 @@ def open_stream_capture(
 
 
 def fitted_capture(stream: FrameSource) -> str:
-    """Return the path of a stream's capture, which is in the `capture.json` beside it; in the
-    header of older streams.
+    """Return the path of a stream's capture, which is in the `capture.json` beside it.
 
     Raises:
         FileNotFoundError: no path is stored, or the folder is not there any more.
     """
-    documents = [stream.metadata]
-    with suppress(OSError, ValueError):
-        documents.append(read_json(stream.path.with_name(CAPTURE)))
-    entries = [fields.get("capture") for fields in documents if isinstance(fields, dict)]
-    paths = [path for path in entries if isinstance(path, str)]
-    if folder := next((path for path in paths if Path(path).is_dir()), None):
-        return folder
+    path = None
+    with suppress(OSError, ValueError, LookupError, TypeError):
+        path = read_json(stream.path.with_name(CAPTURE))["capture"]
+    if isinstance(path, str) and Path(path).is_dir():
+        return path
     raise FileNotFoundError(
         f"{stream.path}: expected the path of its capture in the capture.json beside it, found "
-        f"{paths[0] if paths else 'none'}; if it has moved, name its folder with --capture."
+        f"{path or 'none'}; if it has moved, name its folder with --capture."
     )
 
 

@@ -263,11 +263,9 @@ def test_evaluate_stream__compares_the_light_of_an_hdr_recording(tmp_path):
             light = 2 * decode_light(np.array(rasterize(moved(t), camera).color))
             planes = {name: light[..., k] for k, name in enumerate("RGB")}
             write_exr(tmp_path / "capture" / camera.name / f"{t:04d}.exr", planes)
-    metadata = {"capture": str(tmp_path / "capture"), "test_view": 0}
-    write_stream(
-        tmp_path / "s.morgs", metadata | {"transfer": {"name": TRANSFER, "display_exposure": -1}}
-    )
-    scores = evaluate_stream(tmp_path / "s.morgs").scores
+    transfer = {"name": TRANSFER, "display_exposure": -1}
+    write_stream(tmp_path / "s.morgs", {"test_view": 0, "transfer": transfer})
+    scores = evaluate_stream(tmp_path / "s.morgs", tmp_path / "capture").scores
     color = np.array(rasterize(moved(0), CAMERAS[0]).color)
     light, truth = (gain * decode_light(color) for gain in (1, 2))
     assert truth.max() > 1

@@ -36,7 +36,7 @@ from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, wr
 
 
 def capture_of(stream):
-    return open_stream_capture(stream, None, [0])
+    return open_stream_capture(stream, stream.path.parent, [0])
 
 
 @pytest.mark.usefixtures("small_images")
@@ -108,7 +108,7 @@ def test_render_config__ignores_settings_that_went():
 def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
     tmp_path, metadata, read, message
 ):
-    write_stream(tmp_path / "s.morgs", {"capture": str(tmp_path), **metadata})
+    write_stream(tmp_path / "s.morgs", metadata)
     stream = open_stream(tmp_path / "s.morgs")
     with pytest.raises(ValueError, match=rf"s.morgs: packet 0: .*{message}"):
         read(stream)
@@ -189,17 +189,10 @@ def test_explained_image__has_the_wheel_of_motion_in_a_corner():
     assert_array_equal(explained_image("color", color), channel_image("color", color))
 
 
-@pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
-def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip, tmp_path, stored):
+def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip, tmp_path):
     capture = str(fitted_clip / "capture")
-    header = {"test_view": 0}
-    if stored != "beside":
-        header |= {"capture": capture if stored == "header" else str(tmp_path / "moved")}
-    write_stream(tmp_path / "stream.morgs", header)
-    # Earlier versions stored the path beside the stream as it was given, relative to an unknown
-    # folder.
-    beside = "capture" if stored == "header" else capture
-    (tmp_path / "capture.json").write_text(json.dumps({"capture": beside}))
+    write_stream(tmp_path / "stream.morgs", {"test_view": 0})
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": capture}))
     assert str(open_stream_capture(open_stream(tmp_path), None, [0, 1, 2]).path) == capture
 
 
@@ -230,8 +223,8 @@ def test_open_stream_capture__recognises_the_recording_by_its_fingerprint(
 
 
 def test_open_stream_capture__asks_for_a_capture_that_has_moved(fitted_clip, tmp_path):
-    write_stream(tmp_path / "stream.morgs", {"test_view": 0, "capture": ["x"]})
-    for content in ("{", '{"capture": 3}'):
+    write_stream(tmp_path / "stream.morgs", {"test_view": 0, "capture": str(fitted_clip)})
+    for content in ("{", "[]", '{"capture": null}'):
         (tmp_path / "capture.json").write_text(content)
         with pytest.raises(
             FileNotFoundError,

@@ -543,8 +543,9 @@ def test_viewer__names_a_capture_that_is_missing(clip, url, tmp_path):
 
 
 @pytest.mark.parametrize("capture", [5, "\0"])
-def test_viewer__starts_whatever_a_header_calls_its_capture(tmp_path, capture):
-    write_stream(tmp_path / "stream.morgs", 1, metadata={"capture": capture})
+def test_viewer__starts_whatever_the_path_of_its_capture_is(tmp_path, capture):
+    write_stream(tmp_path / "stream.morgs", 1)
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": capture}))
     with viewing(tmp_path) as url:
         assert b'data-server="exact"' in get(url)[1]
 
