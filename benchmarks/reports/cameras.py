@@ -28,6 +28,7 @@ import tyro
 
 from benchmarks.reports.fits import new_loop, random_capture, synthetic
 from benchmarks.reports.plots import grouped, markdown, span
+from benchmarks.reports.registration import register_camera
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
@@ -35,7 +36,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.extras.calibration.bundle import changed_camera
-from morgs_mi.extras.calibration.refine import refine_cameras, register_camera
+from morgs_mi.extras.calibration.refine import refine_cameras
 from morgs_mi.extras.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.fit.fit_config import FitConfig

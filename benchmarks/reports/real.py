@@ -24,12 +24,12 @@ import tyro
 
 from benchmarks.reports.fits import new_loop
 from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.registration import register_camera
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.view import View
-from morgs_mi.extras.calibration.refine import register_camera
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig

@@ -139,9 +139,9 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
 def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
     """Yield the sentences about the views in the report of the first frame."""
     refinement = validation.get("refinement", {})
-    held_out = refinement.get("held_out", {})
-    others = (validation.get("exposure", {}), validation, validation.get("draft", {}))
-    for part in (refinement, held_out, *others):
+    exposure = validation.get("exposure", {})
+    draft = validation.get("draft", {})
+    for part in (refinement, exposure, validation, draft):
         if "sentence" in part:
             yield part["sentence"]
 

@@ -18,7 +18,6 @@ from morgs_mi.capture.fingerprint import image_fingerprints
 from morgs_mi.capture.points import dense_points, match_capture, triangulate_points
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.view import View, Views
 from morgs_mi.fit.budget import check_capacity
 from morgs_mi.fit.initialise import unseen_points
@@ -146,7 +145,7 @@ def stream_capture(
             for frame, upcoming in with_next(frames):
                 stage = later_frames.part(frame.index - 1, last) if frame.index else stages
                 packet, report = push_frame(loop, frame, stage.report, upcoming, show)
-                report = prepared.completed(report, loop.gaussians, frame, config)
+                report = prepared.completed(report)
                 report = replace(report, fingerprints=image_fingerprints(frame.images))
                 recording.push(packet, report, loop.state.coded)
         return recording.reports
@@ -179,11 +178,9 @@ class Prepared:
 
     #: With enough points, and with refined cameras where the settings ask for them.
     capture: Capture
-    #: Returns the changes of the cameras and their gain, for the report of the first frame; None if
-    #: they are the calibration's.
-    validation: (
-        Callable[[Capture, Gaussians, PartialFrame, StreamConfig], dict[str, Any]] | None
-    ) = None
+    #: `refinement` with the changes of the cameras and their gain; empty if they are the
+    #: calibration's.
+    validation: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -202,27 +199,13 @@ class Prepared:
         stage = progress.of("Refining cameras")
         refine_cameras = extra("cameras", "refine")
         capture, refinement = refine_cameras(capture, config.fit, config.render, config.seed, stage)
-        return cls(capture, refinement.validation)
+        return cls(capture, {"refinement": refinement.as_dict()})
 
-    def completed(
-        self,
-        report: FrameReport,
-        gaussians: Gaussians | None,
-        frame: PartialFrame,
-        config: StreamConfig,
-    ) -> FrameReport:
-        """Return the report of a frame; the first one includes the findings about the cameras.
-
-        Args:
-            report: of the frame.
-            gaussians: of the frame.
-            frame: its images.
-            config: settings of the fit.
-        """
-        if self.validation is None or frame.index or gaussians is None:
+    def completed(self, report: FrameReport) -> FrameReport:
+        """Return the report of a frame; the first one includes the findings about the cameras."""
+        if report.frame:
             return report
-        result = self.validation(self.capture, gaussians, frame, config)
-        return replace(report, validation=report.validation | {"refinement": result})
+        return replace(report, validation=report.validation | self.validation)
 
 
 def begin_as(source: Path, out: Path, capture: Capture, metadata: dict[str, Any]) -> None:

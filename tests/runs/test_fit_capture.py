@@ -517,7 +517,6 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(
     )
     first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
     assert first["taken"]
-    assert first["held_out"]["registered_psnr"] >= first["held_out"]["calibrated_psnr"]
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
     assert stream_of(tmp_path) == whole

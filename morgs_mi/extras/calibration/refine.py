@@ -7,16 +7,8 @@ then compared by the PSNR of withheld pixels, blocks of every training view that
 the calibrated cameras, and with the changed ones.
 
 Cameras stay in the calibration's frame of reference and keep their mean focal length (see
-`bundle`). A camera that is not refined therefore fits as before. Points move with the cameras to
-keep their projections. The held-out view keeps its calibrated camera; `register_camera` fits a
-camera to its image while the Gaussians are frozen. With their blend weights w fixed, the error e =
-target - image is linear in the shift u of a splat (Lucas and Kanade 1981; as in `method.motion`):
-with the gradient g, it becomes e + g . u. A Gaussian is therefore an observation of
-`NormalEquations` with
-
-    G = sum_x w g g' / v,    b = sum_x w e g / v,
-
-where the variance v is the mean square error times the number of pixels with similar errors.
+`bundle`). A camera that is not refined, such as the one of the held-out view, therefore fits as
+before. Points move with the cameras to keep their projections.
 """
 
 from __future__ import annotations
@@ -26,27 +18,19 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.lens import Lens, undistorted, undistortion
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import scene_extent, seen_points
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.bundle import (
     CHANGES,
-    NormalEquations,
     bundle_adjust,
-    camera_jacobian,
     changed_camera,
     distorted,
     likely_deviations,
     prior_deviations,
-)
-from morgs_mi.extras.calibration.offset_equations import (
-    blurred,
-    gradient_products,
-    image_gradient,
 )
 from morgs_mi.fit.balance import short_fit_config
 from morgs_mi.fit.features import detect, intersect, join_matches, match_views
@@ -54,36 +38,16 @@ from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, mean_psnr, withheld_blocks
-from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.ssim import Target
 from morgs_mi.platform.bounded import JsonObject
 from morgs_mi.platform.checks import require
 from morgs_mi.platform.config import config_or_default
 from morgs_mi.platform.progress import StepReport
-from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.render_config import RenderConfig
 
 # A camera with features in fewer tracks is not determined by them.
 _MIN_TRACKS = 40
-# Number of pixels with similar errors, because the fit lacks a detail there. They count as one
-# pixel: otherwise priors would have no influence, and a camera would follow the errors of the fit.
-_ALIKE = 10.0
-# px, standard deviations of the blur of images and gradients, one after the other: a blurred image
-# registers errors of several pixels.
-_BLURS = (2.0, 1.0, 0.0)
-# Error at which a pixel has half its weight, relative to white: larger errors are details that the
-# fit lacks.
-_HALF_WEIGHT = 0.1
-# Least mean square error: a rendering compared with itself has an error of 0.
-_LEAST_ERROR = 1e-10
-# Deviation of a fixed distortion; least valid share of a resampled pixel.
-_NO_DISTORTION = 1e-4
+# Least valid share of a resampled pixel.
 _VALID = 0.999
-# Steps of the registration of a camera, which end when they change its pixels by less than this,
-# px.
-_REGISTRATION_STEPS = 30
-_LEAST_SHIFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -123,42 +87,9 @@ class Refinement:
         )
         return f"The cameras were refined, {sizes}{reason}."
 
-    def validation(
-        self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
-    ) -> JsonObject:
-        """Return the result with its sentence, and the PSNR of the held-out views with a sentence,
-        if there are any.
-
-        The PSNR is the mean over these views, in dB: once with the calibrated cameras, once with
-        registered ones.
-
-        Args:
-            capture: with the refined cameras.
-            gaussians: of the first frame.
-            frame: its images.
-            config: settings of the fit.
-        """
-        result = {**asdict(self), "sentence": self.sentence}
-        test = capture.views.at(frame.images).test
-        views = [view for view in test if view.has_image]
-        if not views:
-            return result
-        extent = scene_extent(capture.views.train.cameras)
-        registered = [
-            replace(
-                view, camera=register_camera(gaussians, view, extent, config.fit, config.render)
-            )
-            for view in views
-        ]
-        rigs = {"calibrated_psnr": views, "registered_psnr": registered}
-        held_out: JsonObject = {
-            name: mean_psnr(gaussians, rig, config.render) for name, rig in rigs.items()
-        }
-        held_out["sentence"] = (
-            f"Held-out views have {held_out['calibrated_psnr']:.1f} dB as calibrated, "
-            f"{held_out['registered_psnr']:.1f} dB registered."
-        )
-        return result | {"held_out": held_out}
+    def as_dict(self) -> JsonObject:
+        """Return the result with its sentence, for the report of the first frame."""
+        return {**asdict(self), "sentence": self.sentence}
 
 
 def refine_cameras(
@@ -283,47 +214,6 @@ class RefinementProblem:
         return replace(short_fit_config(self.config), first_frame_steps=steps)
 
 
-def register_camera(
-    gaussians: Gaussians,
-    view: View,
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-) -> Camera:
-    """Return the camera, near the given one, with which frozen Gaussians fit an image best.
-
-    Args:
-        gaussians: frozen.
-        view: the calibrated camera and its image.
-        extent: scene extent, world units.
-        config: settings with the priors of the changes.
-        render: cut-offs.
-    """
-    priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
-    deviations = prior_deviations(extent, priors)
-    target = Target(view.image, view.mask)
-    means = np.asarray(gaussians.means, np.float64)
-    best = np.zeros((1, CHANGES))
-    for blur in _BLURS:
-        changes = best
-        error = np.inf
-        for _ in range(_REGISTRATION_STEPS):
-            camera = changed_camera(view.camera, changes[0])
-            G, b, new_error = _shifts(gaussians, camera, target, blur, render)
-            if not new_error < error:
-                break
-            best = changes
-            error = new_error
-            of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
-            equations = NormalEquations(1, 0)
-            equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
-            step, _ = equations.step(changes, deviations, 0.0, np.zeros((0, CHANGES)))
-            changes = changes + step
-            if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
-                break
-    return changed_camera(view.camera, best[0])
-
-
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
     """Return views with changed cameras, and images and masks without the cameras' distortion."""
     changed_views = []
@@ -363,20 +253,3 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
     is_determined = (np.sum(masks, axis=0) >= 2) & np.isfinite(intersections).all(axis=1)
     return np.where(is_determined[:, None], intersections, points).astype(np.float32)
-
-
-def _shifts(
-    gaussians: Gaussians, camera: Camera, target: Target, blur: float, render: RenderConfig
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return G v [N, 2, 2] and b v [N, 2] of the module docstring in a view, and the mean square
-    error.
-    """
-    view = ActiveView(camera, render)
-    image = render_view(gaussians, view).color
-    error = target.difference(image)
-    square = max(float(np.mean(error**2)), _LEAST_ERROR)
-    # The mean of the rendering and the target, or the rendering where the target is masked.
-    gradient = image_gradient(blurred((np.asarray(image) + 0.5 * error).astype(np.float32), blur))
-    error = blurred(error, blur)
-    weight = 1 / (1 + np.sum(error**2, axis=-1) / _HALF_WEIGHT**2)
-    return *gradient_products(gaussians, view, error, gradient, weight), square

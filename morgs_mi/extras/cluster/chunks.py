@@ -22,7 +22,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import TruncatedStreamError, decode_packet
-from morgs_mi.codec.packets import decode, reemitted_keyframe
+from morgs_mi.codec.packets import reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.extras.cluster.tasks import (
     COMMON_FRAMES,
@@ -203,9 +203,7 @@ class ChunkedRun:
         if first.frame < stop:
             part = self._submitted([replace(first, stop=stop)])[0].result()
             if prepared is not None:
-                gaussians = decode(None, decode_packet(part.packets[0])).gaussians
-                frame = next(prepared.capture.partial_frames(0, 1))
-                report = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
+                report = prepared.completed(part.reports[0])
                 part = replace(part, reports=(report, *part.reports[1:]))
             self.add_part(part)
             first = replace(part.chunk, stop=first.stop)

@@ -267,7 +267,7 @@ def _fit(
                 packet, report = push_frame(
                     loop, frame, None if rows else on_stage, None, provisional.show
                 )
-                report = prepared.completed(report, loop.gaussians, frame, config)
+                report = prepared.completed(report)
                 writing_task.result()
                 row = LiveFrame(
                     frame.index,

@@ -7,13 +7,12 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.core.view import View, Views
+from morgs_mi.core.view import Views
 from morgs_mi.extras.calibration.bundle import changed_camera
 from morgs_mi.extras.calibration.refine import (
     Refinement,
     RefinementProblem,
     refine_cameras,
-    register_camera,
 )
 from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
 from morgs_mi.fit.view import rendered, withheld_blocks
@@ -79,15 +78,6 @@ def matched(monkeypatch):
     monkeypatch.setattr(
         RefinementProblem, "matched", lambda self: (wrong_changes(len(self.indices)), 100)
     )
-
-
-@pytest.mark.parametrize("scale", [0.0, 1.0])
-def test_register_camera__finds_the_camera_of_an_image(scale):
-    start = disturbed(CAMERAS[:1], scale)[0]
-    image = image_of(CAMERAS[0])
-    camera = register_camera(splats(), View(start, image), 1.0, FitConfig(), RenderConfig())
-    error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
-    assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
 
 
 @pytest.mark.parametrize(("gain", "accepted"), [(0.05, False), (0.2, True)])
