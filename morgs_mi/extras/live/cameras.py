@@ -197,12 +197,7 @@ class CameraFeed:
                     f"{self._timeout:g} s (--timeout)",
                 )
             self._change.wait(time_left)
-        # The warm-up, unless a camera ends.
-        end = time.monotonic() + self._warm_up
-        while (time_left := end - time.monotonic()) > 0 and all(
-            camera.reason is None for camera in self._cameras.values()
-        ):
-            self._change.wait(time_left)
+        self._change.wait_for(self._stop_event.is_set, self._warm_up)
 
 
 class _Camera(Thread):

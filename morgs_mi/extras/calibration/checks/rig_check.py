@@ -106,7 +106,7 @@ def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures
     has_many = 2 * len(errors) >= _MIN_MATCHES * len(checks)
     correction = _correct_rig(layout, pairs.sampled()) if has_many else None
     if correction:
-        corrected, explanation = correction
+        corrected = correction[0]
         # The views with another corrected camera are wrong.
         views = range(len(cameras))
         culprits = {view for view in views if corrected[view] is not pairs.cameras[view]}
@@ -114,24 +114,16 @@ def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures
         for view in culprits:
             if checks[view].matches:
                 checks[view] = replace(checks[view], fits=False, advice="")
-        advice = f"the poses do not fit the images: {explanation}."
-    else:
-        wrong = ", ".join(c.name for c in checks if c.fits is False)
-        not_checked = ", ".join(c.name for c in checks if c.fits is None)
-        count = sum(c.fits is True for c in checks)
-        rest = f"; not checked: {not_checked}" if not_checked else ""
-        if wrong:
-            advice = f"the poses of {wrong} do not fit the images{rest}."
-        elif not count:
-            advice = (
-                "too few matches to check the poses: the views have little overlap, the scene has "
-                "little texture, or the first images are black."
-            )
-        else:
-            some = f" of {count} of {len(checks)} cameras" if not_checked else ""
-            advice = f"the poses{some} fit the images{rest}."
-    verdicts = [check.fits for check in checks]
-    fits = False if False in verdicts else None if None in verdicts else True
+    wrong = ", ".join(check.name for check in checks if check.fits is False)
+    not_checked = ", ".join(check.name for check in checks if check.fits is None)
+    advice = "the poses fit the images."
+    if correction:
+        advice = f"the poses do not fit the images: {correction[1]}."
+    elif wrong:
+        advice = f"the poses of {wrong} do not fit the images."
+    elif not_checked:
+        advice = f"the poses of {not_checked} could not be checked."
+    fits = False if wrong else None if not_checked else True
     return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
 
 
