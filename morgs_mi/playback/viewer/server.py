@@ -62,8 +62,8 @@ class Viewer:
     Args:
         stream: stream, which may still be written, or file of Gaussians, as `open_stream` returns
             it.
-        host: address or name of the server. If other machines can reach it, the link has a random
-            token.
+        host: IPv4 address or name of the server. If other machines can reach it, the link has a
+            random token.
         port: port of the server; 0: a free one.
         capture: folder of the capture with the recorded images; None: the one that was fitted.
 
@@ -91,19 +91,17 @@ class Viewer:
             self._path.write_bytes(published_bytes(stream))
         self._exact = ExactImages(self._opened)
         try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._socket = socket.create_server((host, port), family=family)
+            self._socket = socket.create_server((host, port))
         except (OSError, OverflowError) as error:
             raise ValueError(
-                f"{host}:{port}: cannot serve the page there ({error}); choose another --port."
+                f"{host}:{port}: cannot serve the page there ({error}); choose another --port, or "
+                "the IPv4 address of this machine."
             ) from None
         address, port = self._socket.getsockname()[:2]
         self.is_public = not ip_address(address).is_loopback
         self._recorded = RecordedImages(capture, self.is_public)
         token = secrets.token_urlsafe() if self.is_public else ""
-        name = f"[{host}]" if ":" in host else host
-        if ip_address(address).is_unspecified:
-            name = "localhost"
+        name = "localhost" if ip_address(address).is_unspecified else host
         self.url = f"http://{name}:{port}/{token and token + '/'}"
         routes = [
             Route("/", self._send_page),
