@@ -45,7 +45,7 @@ from benchmarks.reports.trial_rule import (
     verdict,
 )
 from benchmarks.speed.output import Output, commit
-from morgs_mi import Gaussians, StreamLoop, rasterize
+from morgs_mi import StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
 from morgs_mi.evaluate.metrics import endpoint_error, psnr, recorded_change
 from morgs_mi.evaluate.results import known_mean
@@ -244,8 +244,7 @@ class Opened:
             "steps": report.steps,
             "pixels": report.active.get("pixels", 1.0),
         }
-        assert loop.gaussians is not None
-        return scores | scores_of(loop.gaussians, self.capture, frame, last)
+        return scores | scores_of(loop, self.capture, frame, last)
 
 
 def measure(opened: Opened, off: Sequence[str], seed: int) -> dict[str, Any]:
@@ -274,9 +273,11 @@ def measure(opened: Opened, off: Sequence[str], seed: int) -> dict[str, Any]:
 
 
 def scores_of(
-    gaussians: Gaussians, capture: Capture, frame: PartialFrame, last: PartialFrame | None
+    loop: StreamLoop, capture: Capture, frame: PartialFrame, last: PartialFrame | None
 ) -> dict[str, float]:
     """Return the mean scores of the held-out views of a frame; `last` is the frame before."""
+    assert loop.gaussians is not None
+    render = loop.setup.config.render  # with the background that the fit has found
     views = []
     for v in capture.test_views:
         view = frame.views[v]
@@ -284,7 +285,7 @@ def scores_of(
             continue
         camera = view.camera
         image = view.image
-        maps = rasterize(gaussians, camera, ("color", "motion"))
+        maps = rasterize(loop.gaussians, camera, ("color", "motion"), config=render)
         rendered = to_uint8(np.asarray(maps.color))
         scores = {"psnr": psnr(rendered, image, view.mask)}
         last_image = None if last is None else last.images[v]
