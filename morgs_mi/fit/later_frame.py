@@ -43,11 +43,17 @@ from morgs_mi.method.objective import (
 from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.platform.progress import Progress
+from morgs_mi.render.active_view import lists_of_views, view_groups
 from morgs_mi.render.rasterize import check_rendering, render_view
+from morgs_mi.render.shared_lists import ViewLists
 
 # Fraction of the epochs after which the round of density control is due: the residual has shown by
 # then where Gaussians are missing, and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
+# Distance in px by which lists reach beyond a block: splats move while an epoch shares them.
+_MARGIN = 1.0
+# Number of Gaussians times views whose lists are built at once, at most: it bounds the memory.
+_MOST_SPLATS = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,14 +195,16 @@ class _ResidualFit:
         if is_recordable(problem.views.values(), config.objective):
             views = problem.views
             self._later_steps = LaterSteps(views, self._optimizer, config.objective, motion)
-        self._recorded_steps = self._recorded()
+        self._groups = view_groups(problem.views, _MOST_SPLATS // len(self._previous))
+        self._lists: Mapping[int, ViewLists] = {}  # of the epoch
 
-    def _recorded(self) -> RecordedSteps | None:
-        """Return the steps of the active Gaussians as recordings; None if these do not exist."""
+    def _recorded_steps(self) -> RecordedSteps | None:
+        """Return the steps with the present lists as recordings; None if these do not exist."""
         if self._later_steps is None:
             return None
         problem = self._problem
-        return self._later_steps.of(self._previous, problem.active.num_gaussians, problem.extent)
+        num_gaussians = problem.active.num_gaussians
+        return self._later_steps.of(self._previous, num_gaussians, problem.extent, self._lists)
 
     def epoch(self, steps: Steps, rates: LearningRates, is_scored: bool) -> dict[str, float]:
         """Make the steps of an epoch, and return their mean losses by name.
@@ -211,13 +219,14 @@ class _ResidualFit:
             # epoch.
             count = len(self._problem.views)
             self._scores = ErrorPerGaussian(len(self.source), count - (count + 3) // 4)
+        self._lists = lists_of_views(self._groups, self._gaussians(), _MARGIN)
         return optimise(
             self._optimizer,
             rates.by_parameter(self._problem.extent),
             self._losses_at,
             replace(steps, observer=self._scores),
             weights_of(self._config.objective),
-            self._recorded_steps,
+            self._recorded_steps(),
         )
 
     def density_round(self, rng: np.random.Generator) -> None:
@@ -233,7 +242,6 @@ class _ResidualFit:
         self._previous = apply_plan(self._previous, plan)
         self.source = plan.source
         self._scores = None
-        self._recorded_steps = self._recorded()
 
     def _gaussians(self) -> Gaussians:
         """Return the active Gaussians after the residual."""
@@ -263,8 +271,9 @@ class _ResidualFit:
         # Motion, confidence and scores must not move opacity and geometry.
         names = channels if features is None else (*channels, "features")
         detached_channels = [name for name in names if name != "color"]
+        drawn = replace(view, lists=self._lists[index])
         image = render_view(
-            gaussians, view, channels, features=features, detach_weights=detached_channels
+            gaussians, drawn, channels, features=features, detach_weights=detached_channels
         )
         if scores is not None and features is not None:
             scores.observe(image, view.target, view.region)
