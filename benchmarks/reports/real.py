@@ -26,7 +26,7 @@ from benchmarks.reports.fits import new_loop
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.registration import register_camera
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
-from morgs_mi import Gaussians, rasterize
+from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.view import View
@@ -114,7 +114,8 @@ def measure(capture: Capture, pictures: Path | None, config: StreamConfig) -> di
     gaussians = loop.gaussians
     assert gaussians is not None
     extent = loop.setup.extent
-    cameras = [register_camera(gaussians, view, extent, config.fit, config.render) for view in test]
+    render = loop.setup.config.render  # with the background that the fit has found
+    cameras = [register_camera(gaussians, view, extent, config.fit, render) for view in test]
     groups = {
         "training": train,
         "held_out": test,
@@ -123,8 +124,9 @@ def measure(capture: Capture, pictures: Path | None, config: StreamConfig) -> di
         ],
     }
     if pictures is not None:
-        _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, test[0])
-    scores = {name: mean_psnr(gaussians, group, config.render) for name, group in groups.items()}
+        path = pictures / f"{capture.path.name}.jpg"
+        _write_picture(path, gaussians, test[0], render)
+    scores = {name: mean_psnr(gaussians, group, render) for name, group in groups.items()}
     return scores | {
         "views": len(train),
         "held_out_views": len(test),
@@ -134,9 +136,9 @@ def measure(capture: Capture, pictures: Path | None, config: StreamConfig) -> di
     }
 
 
-def _write_picture(path: Path, gaussians: Gaussians, view: View) -> None:
+def _write_picture(path: Path, gaussians: Gaussians, view: View, render: RenderConfig) -> None:
     """Write a recorded image and its rendering side by side."""
-    image = np.asarray(rasterize(gaussians, view.camera, ("color",)).color)
+    image = np.asarray(rasterize(gaussians, view.camera, ("color",), config=render).color)
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = side_by_side([label(view.image, "held-out image"), label(image, "rendered")])
     cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
