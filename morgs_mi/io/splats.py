@@ -18,10 +18,9 @@ import numpy as np
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply
-from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply import read_ply
-from morgs_mi.platform.checks import LARGEST, few
+from morgs_mi.platform.checks import LARGEST, few, require
 
 _log = logging.getLogger(__name__)
 
@@ -36,6 +35,11 @@ _WORDS = {
 _MOST_NAMED = 3
 SUFFIXES = (".compressed.ply", ".ply", ".splat")
 """Ends of the names of files that `read_splats` reads."""
+CONVERT = (
+    "convert it to .ply with SuperSplat (superspl.at/editor) or splat-transform "
+    "(@playcanvas/splat-transform), or export .ply from the program that wrote it"
+)
+"""What to do with Gaussians in another format, for messages."""
 _RECORD = np.dtype(
     [
         ("means", "<f4", 3),
@@ -135,12 +139,10 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
             Gaussians.
     """
     path = existing_file(path, "a file with Gaussians")
-    refuse_foreign(path)
     suffix = suffix_of(path)
-    if suffix is None:
-        raise ValueError(
-            f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, got {path.suffix!r}."
-        )
+    require(
+        suffix, path, "expected Gaussians as .ply, .compressed.ply or .splat", path.name, CONVERT
+    )
     with path.open("rb") as file:
         header = file.read(4096).partition(b"end_header")[0]
     if suffix == ".splat":

@@ -13,9 +13,8 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import existing_file, listed
-from morgs_mi.io.splats import read_splats, suffix_of
+from morgs_mi.io.splats import CONVERT, read_splats, suffix_of
 from morgs_mi.platform.checks import errors_at, few, quantity, require
 from morgs_mi.platform.files import PROVISIONAL, STREAM
 from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, default_rig, scene_box
@@ -88,8 +87,6 @@ def stream_path(out: str | Path) -> Path:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; check the path.")
     if path.is_dir() and not (path / STREAM).exists():
-        if (path / "meta.json").is_file():
-            refuse_foreign(path / "meta.json")
         inner = [file for file in listed(path) if suffix_of(file) or (file / STREAM).is_file()]
         require(
             not inner,
@@ -104,13 +101,12 @@ def stream_path(out: str | Path) -> Path:
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
     if start != MAGIC:
-        refuse_foreign(path)
         require(
             suffix_of(path) or path.suffix == ".morgs",
             path,
             "expected a stream, or Gaussians as .ply, .compressed.ply or .splat",
-            "another kind of file",
-            "name the folder of a fit, or fit a capture first",
+            path.name,
+            f"name the folder of a fit, fit a capture first, or if it has Gaussians, {CONVERT}",
         )
     return path
 

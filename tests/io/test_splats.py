@@ -9,6 +9,7 @@ from numpy.testing import assert_array_equal
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.splats import read_splats
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.testing import assert_close
 from tests.scenes.changing_splats import splats
 
@@ -44,7 +45,6 @@ def test_read_splats__recognises_a_compressed_ply(tmp_path, name):
         ),
         ("a.ply", b"", "expected a complete PLY file, .* it does not begin with `ply`"),
         ("a.ply", b"ply\nformat ascii 1.0\n", "its header does not end"),
-        ("a.xyz", b"", r"name that ends in .compressed.ply, .ply, .splat, got '.xyz'"),
     ],
 )
 def test_read_splats__names_what_is_broken(tmp_path, name, content, message):
@@ -52,6 +52,24 @@ def test_read_splats__names_what_is_broken(tmp_path, name, content, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_splats(tmp_path / name)
     assert str(tmp_path / name) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a.spz", "meta.json", "e.ply.gz", "a.GLB", "chkpnt30000.pth"])
+def test_read_splats__names_what_converts_other_formats(tmp_path, name):
+    (tmp_path / name).touch()
+    for door in (open_stream, read_splats):
+        with pytest.raises(
+            ValueError, match=rf"{name}: expected .*\.ply, .*splat, got {name}; .*SuperSplat"
+        ):
+            door(tmp_path / name)
+
+
+def test_open_stream__names_what_to_do_with_a_folder_of_gaussians(tmp_path):
+    (tmp_path / "1.ply").touch()
+    with pytest.raises(
+        ValueError, match=r"got a folder with 1\.ply; name one of them, or .*import"
+    ):
+        open_stream(tmp_path)
 
 
 def test_read_splats__names_a_missing_file(tmp_path):

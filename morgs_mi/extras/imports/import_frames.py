@@ -27,10 +27,9 @@ from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.numbering import natural_key
-from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
+from morgs_mi.io.splats import CONVERT, SUFFIXES, read_splats, suffix_of
 from morgs_mi.platform.checks import check_number, errors_at, require
 from morgs_mi.platform.config import config_or_default
 from morgs_mi.platform.files import STREAM, atomic_path
@@ -171,16 +170,11 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
     if len(paths) == 1 and paths[0].is_dir():
         files = sorted(listed(paths[0]), key=lambda path: natural_key(path.name))
         paths = [path for path in files if path.is_file() and suffix_of(path)]
-        for file in files if not paths else ():
-            refuse_foreign(file)
     kinds = f"files whose names end in {', '.join(SUFFIXES)}"
-    require(paths, place, f"expected a folder with {kinds}", "none", "convert the frames")
+    require(paths, place, f"expected a folder with {kinds}", "none", CONVERT)
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
-        refuse_foreign(first[None])
-        raise ValueError(
-            f"{first[None]}: expected one folder, or {kinds}, got another; convert it."
-        )
+        raise ValueError(f"{first[None]}: expected one folder, or {kinds}, got another; {CONVERT}.")
     require(
         len(first) == 1,
         place,
