@@ -111,9 +111,9 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
         FileNotFoundError: there is no such file.
         ValueError: it is not a PLY file, is truncated, or lacks a property.
     """
-    elements = read_elements(path, ("chunk", "vertex"), ("sh",))
-    chunks = elements["chunk"]
-    vertices = elements["vertex"]
+    elements = read_elements(path)
+    chunks = elements.get("chunk", {})
+    vertices = elements.get("vertex", {})
     rest = elements.get("sh", {})
     K = 1 + len(rest) // 3
     has_colors = "min_r" in chunks  # older writers have no bounds of the colours

@@ -16,14 +16,12 @@ names and shapes.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyParseError
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.gaussians import Gaussians
@@ -31,27 +29,14 @@ from morgs_mi.core.geometry import unit_quats
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.ply_kinds import as_3dgs
+from morgs_mi.platform.checks import require
 from morgs_mi.platform.files import atomic_path
 
 _MEAN = ("x", "y", "z")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-# Type names of the format and of its older writers.
-_TYPES = {
-    name: dtype
-    for dtype, names in {
-        "i1": ("char", "int8"),
-        "u1": ("uchar", "uint8"),
-        "i2": ("short", "int16"),
-        "u2": ("ushort", "uint16"),
-        "i4": ("int", "int32"),
-        "u4": ("uint", "uint32"),
-        "f4": ("float", "float32"),
-        "f8": ("double", "float64"),
-    }.items()
-    for name in names
-}
-_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Bytes in which a header ends: that of SH of degree 3 and all attributes has 3 kB.
+_LONGEST_HEADER = 65_536
 # Beyond these, an opacity is 0 or 1 and a size is 0, which other tools store as infinite numbers.
 _BOUNDS = {"opacity": (-99, 99), **dict.fromkeys(_SCALE, (-69, None))}
 SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}
@@ -176,94 +161,38 @@ def read_vertices(path: str | Path) -> Arrays:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: as `read_elements`.
+        ValueError: as `read_elements`, or there are no vertices.
     """
-    return read_elements(path, ("vertex",))["vertex"]
+    elements = read_elements(path)
+    require("vertex" in elements, path, "expected vertices", [*elements], "export it again")
+    return elements["vertex"]
 
 
-def read_elements(
-    path: str | Path, required: Sequence[str], optional: Sequence[str] = ()
-) -> dict[str, Arrays]:
-    """Return the properties of elements of a PLY file, by the names of element and property, each
-    [rows].
+def read_elements(path: str | Path) -> dict[str, Arrays]:
+    """Return the properties of a PLY file, by the names of element and property, each [rows].
 
-    Written by hand because plyfile allocates what the header claims, and Python objects for lists.
-    Elements after the last one of these are not read; that one and those before it must have no
-    lists.
+    Binary files are mapped into memory. Lists are refused, because each would become an object.
 
     Args:
         path: the file, binary or text.
-        required: names of elements.
-        optional: names of elements that are left out of the result where the file does not have
-            them.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, lacks an element, or has fewer rows than its header
-            claims.
+        ValueError: it is not a PLY file, has lists, or has fewer rows than its header claims.
     """
+    existing_file(path, "a PLY file")
     try:
-        with existing_file(path, "a PLY file").open("rb") as file:
-            order, elements = _read_header(file)
-            names = {name for name, *_ in elements}.intersection((*required, *optional))
-            for name in required:
-                if name not in names:
-                    raise ValueError(f"it has no element {name}")
-            properties: dict[str, Arrays] = {}
-            for element, count, fields in elements:
-                if properties.keys() == names:
-                    break
-                if any(kind == "list" for kind, *_ in fields):
-                    raise ValueError(f"its element {element} has lists, write it without them")
-                dtype = np.dtype([(name, order + _TYPES[kind]) for kind, name, *_ in fields])
-                # A number in a text takes a digit and a separator.
-                size = count * dtype.itemsize if order else 2 * count * len(fields) - 1
-                num_bytes = os.fstat(file.fileno()).st_size - file.tell()
-                if count < 0 or size > num_bytes:
-                    raise ValueError(f"{count} {element} need {size} bytes, {num_bytes} follow")
-                if element not in names:
-                    if order:
-                        file.seek(count * dtype.itemsize, 1)
-                    else:
-                        next(islice(file, count, count), None)
-                    continue
-                if order:
-                    table = np.fromfile(file, dtype, count)
-                elif count:
-                    table = np.loadtxt(islice(file, count), dtype, ndmin=1)
-                else:
-                    table = np.empty(0, dtype)
-                if len(table) < count:
-                    raise ValueError(f"expected {count} rows of {element}, got {len(table)}")
-                properties[element] = {name: table[name] for name in table.dtype.names or ()}
-            return properties
-    except (ValueError, KeyError, IndexError, OverflowError) as error:
+        with open(path, "rb") as file:
+            header, end, _ = file.read(_LONGEST_HEADER).partition(b"end_header")
+        if not end or b"\nproperty list" in header:
+            raise ValueError("its header does not end, or has lists, as of the faces of a mesh")
+        elements = PlyData.read(str(path), mmap="r").elements
+        return {e.name: {name: e.data[name] for name in e.data.dtype.names} for e in elements}
+    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise ValueError(
             f"{path}: expected a complete PLY file, got one that cannot be read: {error}; copy or "
             "export it again."
         ) from error
-
-
-def _read_header(file: BinaryIO) -> tuple[str, list[tuple[str, int, list[list[str]]]]]:
-    """Return the byte order, empty for text, and the elements: name, number of rows, and the words
-    of each property's line.
-    """
-    if file.readline(8).strip() != b"ply":
-        raise ValueError("it does not begin with `ply`")
-    order = ""
-    elements = []
-    # Beyond any header: a file without line ends would be read as one line.
-    while line := file.readline(4096):
-        match line.decode("ascii", errors="replace").split():
-            case ["end_header"]:
-                return order, elements
-            case ["format", name, *_]:
-                order = _BYTE_ORDERS[name]
-            case ["element", name, count, *_]:
-                elements.append((name, int(count), []))
-            case ["property", *words]:
-                elements[-1][2].append(words)
-    raise ValueError("its header does not end")
 
 
 def rest_names(K: int) -> tuple[str, ...]:

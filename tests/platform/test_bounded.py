@@ -154,17 +154,17 @@ CASES = {
     "PLY of many vertices": (
         read_vertices,
         ply(BINARY + LARGE),
-        "99999999999 vertex need 399999999996 bytes",
+        "vertex.*early end-of-file",
     ),
     "PLY of negative size": (
         read_vertices,
         ply(BINARY + LARGE.replace("9", "-9", 1)),
-        "-99999999999 vertex",
+        "expected a complete PLY file",
     ),
     "PLY of empty lists": (
         read_vertices,
         ply(BINARY + "element face 3000000\nproperty list uchar int i\n" + LARGE, bytes(3_000_000)),
-        "element face has lists",
+        "or has lists, as of the faces",
     ),
     "compressed PLY of many vertices": (
         read_splats,
@@ -174,7 +174,7 @@ CASES = {
             + LARGE.replace(" x", " packed_position"),
             bytes(4),
         ),
-        "99999999999 vertex need 399999999996 bytes, 0 follow",
+        "vertex.*early end-of-file",
     ),
     "compressed PLY of empty rows": (
         read_splats,

@@ -117,7 +117,7 @@ def test_render__draws_a_thumbnail_for_each_camera(tmp_path, run):
 
 def test_render__names_what_is_no_file_of_gaussians(tmp_path, run):
     (tmp_path / "scene.ply").write_text(MESH)
-    words = "got vertices without f_dc_0, f_dc_1, f_dc_2, opacity, scale_0"
+    words = "its header does not end, or has lists, as of the faces of a mesh"
     assert_refused(run("render", tmp_path / "scene.ply"), f"{tmp_path}/scene.ply: ", words)
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
