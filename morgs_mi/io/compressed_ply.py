@@ -32,7 +32,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
-from morgs_mi.platform.checks import few
+from morgs_mi.platform.checks import few, require
 from morgs_mi.platform.files import atomic_path
 
 _CHUNK = 256
@@ -44,6 +44,7 @@ _BOUNDS = {
         "color": ("r", "g", "b"),
     }.items()
 }
+_BOUND_NAMES = [name for ends in _BOUNDS.values() for names in ends for name in names]
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ_BITS = (11, 10, 11)
 _ROTATION_BITS = (10, 10, 10)
@@ -71,8 +72,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
         "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
     }
-    columns = [name for ends in _BOUNDS.values() for names in ends for name in names]
-    chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in columns])
+    chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in _BOUND_NAMES])
     fractions = {}  # of the values between the bounds of their chunks
     for key, value in values.items():
         value = value.astype(np.float32)
@@ -103,7 +103,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def read_compressed_ply(path: str | Path) -> Gaussians:
-    """Return the Gaussians in a compressed PLY file of any tool, SH of degree 0 to 3.
+    """Return the Gaussians in a compressed PLY file, SH of degree 0 to 3.
 
     Opacities are clipped to [1e-6, 1 - 1e-6], as in `Gaussians.from_activated`.
 
@@ -115,38 +115,30 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
     chunks = elements.get("chunk", {})
     vertices = elements.get("vertex", {})
     rest = elements.get("sh", {})
+    N = len(vertices.get("packed_position", ()))
     K = 1 + len(rest) // 3
-    has_colors = "min_r" in chunks  # older writers have no bounds of the colours
-    bounds = [names for key in _BOUNDS if key != "color" or has_colors for names in _BOUNDS[key]]
-    types = {
-        **dict.fromkeys(_PACKED, "u4"),
-        **dict.fromkeys([name for names in bounds for name in names], "f4"),
-        **dict.fromkeys(rest_names(K), "u1"),
+    expected = {
+        **dict.fromkeys(_PACKED, ("u4", N)),
+        **dict.fromkeys(_BOUND_NAMES, ("f4", -(-N // _CHUNK))),
+        **dict.fromkeys(rest_names(K), ("u1", N)),
     }
-    stored_types = {name: v.dtype.str[1:] for name, v in {**chunks, **vertices, **rest}.items()}
-    N, num_chunks, num_sh = (len(next(iter(e.values()), ())) for e in (vertices, chunks, rest))
-    faults = [
-        f"no {name} of type {kind}"
-        for name, kind in types.items()
-        if stored_types.get(name) != kind
-    ]
-    if num_chunks != -(-N // _CHUNK):
-        faults.append(f"{num_chunks} chunks")
-    if len(rest) not in SH_DEGREES or (rest and num_sh != N):
-        faults.append(f"{num_sh} rows of {len(rest)} SH coefficients")
-    if faults:
-        raise ValueError(
-            f"{path}: expected a compressed PLY of {N} Gaussians, chunks of {_CHUNK} and SH of "
-            f"degree 0 to 3, got {few(faults)}; export it again."
-        )
+    columns = {**chunks, **vertices, **rest}
+    stored = {name: (column.dtype.str[1:], len(column)) for name, column in columns.items()}
+    faults = [name for name, kind in expected.items() if stored.get(name) != kind]
+    require(
+        not faults and len(rest) in SH_DEGREES,
+        path,
+        f"expected a compressed PLY of {N} Gaussians, with the bounds of positions, sizes and "
+        f"colours in chunks of {_CHUNK}, and SH of degree 0 to 3",
+        f"{len(rest)} SH coefficients and another number or type of {few(faults)}",
+        "export it again with SuperSplat or splat-transform",
+    )
     position, scale = (
         _between(chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
         for key in ("position", "scale")
     )
     color = _unpacked(vertices["packed_color"], _COLOR_BITS)
-    base = color[:, :3]
-    if has_colors:
-        base = _between(chunks, "color", base)
+    base = _between(chunks, "color", color[:, :3])
     coeffs = np.empty((N, K, 3), np.float32)
     coeffs[:, 0] = (base - 0.5) / SH_C0
     if rest:

@@ -107,18 +107,18 @@ def infinite(tables):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.pop("chunk"), "expected a compressed PLY .*, got no min_x of type f4"),
+        (lambda t: t.pop("chunk"), "expected a compressed PLY .*, got .* of min_x, "),
         (
             lambda t: t.update(chunk=t["chunk"][:1]),
-            "expected .* of 300 Gaussians, chunks of 256 .*, got 1 chunks",
+            "expected .* of 300 Gaussians, .* chunks of 256, .*, got .* of min_x, ",
         ),
         (
             lambda t: t.update(sh=t["sh"][:9]),
-            "expected .* of 300 Gaussians, .* got 9 rows of 9 SH coefficients",
+            "expected .* of 300 Gaussians, .* got 9 SH coefficients and .* of f_rest_0, ",
         ),
         (
             lambda t: t.update(sh=rename_fields(t["sh"], {"f_rest_8": "f_rest_9"})),
-            "got no f_rest_8 of type u1",
+            "got 9 SH coefficients and another number or type of f_rest_8",
         ),
         (infinite, "others in 256 of 300 Gaussians .centre of 0, 1, 2 and 253 more."),
     ],

@@ -237,5 +237,7 @@ def test_import__refuses(clip, tmp_path, run, monkeypatch, options, message):
 
 def test_import_frames__names_the_remedy_of_a_format_that_is_not_read(tmp_path):
     (tmp_path / "a.spz").touch()
-    with pytest.raises(ValueError, match=r"a\.spz: expected one folder, or files .*splat-transform"):
+    with pytest.raises(
+        ValueError, match=r"a\.spz: expected one folder, or files .*splat-transform"
+    ):
         import_frames([tmp_path / "a.spz"], tmp_path / "out")
