@@ -18,6 +18,7 @@ from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.listing import existing_file
 from morgs_mi.platform.bounded import check_claim
+from morgs_mi.platform.checks import few, require
 from morgs_mi.platform.files import atomic_path
 
 # Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
@@ -63,9 +64,9 @@ def read_light(path: str | Path) -> np.ndarray:
     """Return the image of an EXR file [H, W, 3], float32 in linear light with Rec. 709 primaries,
     not negative.
 
-    The file has the channels R, G, B, a single layer with these, or Y alone. Other primaries, which
-    the attribute `chromaticities` names, are converted by colour-science, with Bradford's
-    adaptation to another white.
+    The file has the channels R, G, B, or Y alone. Other primaries, which the attribute
+    `chromaticities` names, are converted by colour-science, with Bradford's adaptation to another
+    white.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -97,28 +98,25 @@ def opaque_light(path: str | Path) -> np.ndarray:
     """Return the mask [H, W] of the pixels that are stored and opaque, bool.
 
     Raises:
-        FileNotFoundError, OSError, ValueError: as for `read_light`.
+        FileNotFoundError, OSError: as for `read_exr`.
     """
     channels, header = _read(path)
     left_top, right_bottom = header["dataWindow"]
     stored = _displayed(np.ones((right_bottom - left_top + 1)[::-1]), header)
-    return channels.get(f"{_color_names(path, channels)[0][:-1]}A", stored) > 1 - _SAME
+    return channels.get("A", stored) > 1 - _SAME
 
 
-def _color_names(path: str | Path, channels: Arrays) -> list[str]:
+def _color_names(path: str | Path, channels: Arrays) -> tuple[str, str, str]:
     """Return the names of the channels of red, green and blue."""
-    layers = {
-        name[:-1]
-        for name in channels
-        if name[-2:-1] in ("", ".") and {name[:-1] + color for color in "RGB"} <= channels.keys()
-    }
-    if len(layers) == 1 or "" in layers:
-        return [min(layers) + color for color in "RGB"]
-    if not layers and "Y" in channels:
-        return ["Y"] * 3
-    raise ValueError(
-        f"{path}: expected Y, or one layer with R, G, B, got {', '.join(channels)}; rename them."
+    names = ("R", "G", "B") if "R" in channels else ("Y", "Y", "Y")
+    require(
+        {*names} <= channels.keys(),
+        path,
+        "expected the channels R, G, B, or Y",
+        few([*channels]),
+        "save the colours without layers (in Blender as OpenEXR, not as OpenEXR MultiLayer)",
     )
+    return names
 
 
 def _read(path: str | Path) -> tuple[Arrays, dict[str, Any]]:

@@ -80,26 +80,25 @@ def test_read_light__returns_the_display_window_and_opaque_light_its_stored_pixe
         assert_array_equal(opaque_light(path), stored)
 
 
-def test_read_light__reads_grey_or_the_only_layer_with_its_alpha(tmp_path):
+def test_read_light__reads_grey_or_colours_with_their_alpha(tmp_path):
     write_exr(tmp_path / "grey.exr", {"Y": LIGHT[..., 0]})
     assert_array_equal(read_light(tmp_path / "grey.exr"), LIGHT[..., [0, 0, 0]])
     alpha = np.linspace(0, 1.1, 20, dtype=np.float32).reshape(4, 5)
-    for layer in ("", "ViewLayer.Combined."):
-        layers = {f"{layer}{name}": channel for name, channel in channels_of(LIGHT).items()}
-        path = write(tmp_path / "a.exr", {**layers, f"{layer}A": alpha, "depth.Y": LIGHT[..., 1]})
-        assert_array_equal(read_light(path), LIGHT)
-        assert_array_equal(opaque_light(path), alpha >= 1)
+    channels = {**channels_of(LIGHT), "A": alpha, "depth.Y": LIGHT[..., 1]}
+    path = write(tmp_path / "a.exr", channels)
+    assert_array_equal(read_light(path), LIGHT)
+    assert_array_equal(opaque_light(path), alpha >= 1)
 
 
 @pytest.mark.parametrize(
     ("channels", "header", "message"),
     [
         (
-            {f"{view}.{name}": LIGHT[..., 0] for view in ("left", "right") for name in "RGB"},
+            {f"ViewLayer.Combined.{name}": LIGHT[..., 0] for name in "RGB"},
             {},
-            r"or one layer with R, G, B, got left\.B, .*; rename them",
+            r"channels R, G, B, or Y, got ViewLayer\.Combined\.B, .*; save .* without layers",
         ),
-        ({"depth.Y": LIGHT[..., 0]}, {}, r"or one layer with R, G, B, got depth\.Y; rename"),
+        ({"depth.Y": LIGHT[..., 0]}, {}, r"channels R, G, B, or Y, got depth\.Y; save"),
         (channels_of(LIGHT), {"pixelAspectRatio": 2.0}, "square pixels, got the pixel aspect 2"),
         (channels_of(LIGHT + np.inf), {}, r"a\.exr: its image must be finite .* replace such"),
     ],
