@@ -3,7 +3,7 @@
 | kind | recognised by | read |
 |---|---|---|
 | discs of 2D Gaussian Splatting | `scale_0` and `scale_1` alone | with a third axis of size 0 |
-| Mip-Splatting, Gaussian Opacity Fields | `filter_3D` | with the filter in sizes and opacities |
+| Mip-Splatting, Gaussian Opacity Fields | varying `filter_3D` | refused |
 | several timestamps (Spacetime Gaussians, 4DGS, ...) | varying time or motion | refused |
 | anchors of Scaffold-GS | `f_offset_*`, `f_anchor_feat_*` | refused |
 
@@ -33,7 +33,8 @@ _TIME = re.compile(
     r"|scale_3|rot_[4-7]|rot_[lr]_\d"
 )
 _ANCHOR = re.compile(r"f_offset_\d+|f_anchor_feat_\d+")
-_READ = re.compile(r"[xyz]|f_dc_[0-2]|f_rest_\d+|opacity|scale_[0-2]|rot_[0-3]|filter_3D")
+_FILTER = re.compile("filter_3D")
+_READ = re.compile(r"[xyz]|f_dc_[0-2]|f_rest_\d+|opacity|scale_[0-2]|rot_[0-3]")
 _HARMLESS = re.compile(
     r"n[xyz]|normal_?[xyz]|red|green|blue|alpha|[rgba]|(diffuse_)?(red|green|blue)|label\w*"
     r"|\w*_?id|index|segment\w*|cluster\w*|class\w*|instance\w*|semantic\w*|object\w*|category"
@@ -54,6 +55,12 @@ _REFUSED = (
         "expected Gaussians",
         "anchors of Scaffold-GS, of which a network makes the Gaussians of a view",
         "export Gaussians with the program that trained them",
+    ),
+    (
+        _FILTER,
+        "expected Gaussians without a filter",
+        "the 3D filter of Mip-Splatting or Gaussian Opacity Fields",
+        "export fused Gaussians with its program, such as create_fused_ply.py of Mip-Splatting",
     ),
 )
 _GAUSSIAN = {"f_dc_0", "opacity", "scale_0", "rot_0"}
@@ -90,7 +97,6 @@ def as_3dgs(path: str | Path, vertices: Arrays) -> Arrays:
     if names and (folder, names) not in _named:
         _named.add((folder, names))
         _log.warning("%s: it is drawn without %s, which may change the image.", path, names)
-    vertices = _with_filter(vertices)
     if "scale_2" in vertices or not vertices.keys() >= {"scale_0", "scale_1", "opacity"}:
         return vertices
     _log.warning(
@@ -99,23 +105,3 @@ def as_3dgs(path: str | Path, vertices: Arrays) -> Arrays:
         path,
     )
     return {**vertices, "scale_2": np.full(len(vertices["scale_0"]), -np.inf, np.float32)}
-
-
-def _with_filter(vertices: Arrays) -> Arrays:
-    """Return Gaussians with their 3D smoothing filter in sizes and opacities (Mip-Splatting, Yu et
-    al. 2024, eq. 9).
-    """
-    names = ("scale_0", "scale_1", "scale_2", "opacity")
-    if not vertices.keys() >= {*names, "filter_3D"}:
-        return vertices
-    with np.errstate(all="ignore"):
-        squares = np.square(vertices["filter_3D"].astype(np.float64))
-        sizes = {name: 2 * vertices[name].astype(np.float64) for name in names[:3]}
-        wider = {name: np.logaddexp(size, np.log(squares)) for name, size in sizes.items()}
-        ratio = np.exp(0.5 * sum(sizes[name] - wider[name] for name in sizes))
-        columns = {name: 0.5 * size for name, size in wider.items()}
-        opacity = ratio / (1 + np.exp(-vertices["opacity"].astype(np.float64)))
-        columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
-    unfiltered = squares == 0
-    values = {name: np.where(unfiltered, vertices[name], v) for name, v in columns.items()}
-    return {**vertices, **values}
