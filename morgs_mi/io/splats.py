@@ -55,8 +55,7 @@ _RECORD = np.dtype(
 def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float) -> Gaussians:
     """Return the Gaussians of a file without the invalid ones, with a warning that names them.
 
-    An invalid Gaussian has NaN, infinity or a number above 1e12 in an attribute. A rotation of
-    length 0 is none.
+    An invalid Gaussian has NaN, infinity or a number above 1e12 in an attribute.
 
     Args:
         path: the file.
@@ -68,15 +67,6 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     """
     raw = gaussians.numpy()
     N = len(gaussians)
-    zero = np.flatnonzero(~raw["quats"].any(axis=1))
-    if len(zero):
-        _log.warning(
-            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
-            path,
-            len(zero),
-            N,
-            few(zero, _MOST_NAMED),
-        )
     every = np.ones(N, bool)
     faults = []
     for name, values in raw.items():
@@ -89,16 +79,6 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
             faults.append(f"{_WORDS.get(name, name)} of {numbers}")
         every &= rows
     count = int(N - every.sum())
-    if every.any():
-        middle = np.median(raw["means"][every], axis=0)
-        if 10 * np.spacing(np.abs(middle)).max() > np.exp(np.median(raw["log_scales"][every])):
-            _log.warning(
-                "%s: the centres, around (%g, %g, %g), are so far from 0 that float32 rounds them "
-                "by a tenth of the Gaussians' sizes or more; subtract an origin before they are "
-                "exported.",
-                path,
-                *middle,
-            )
     if not count:
         return gaussians
     details = "; ".join(faults)
