@@ -4,7 +4,6 @@ count.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -17,9 +16,9 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     """Return the number in the name of each frame of one clip: the one that changes from name to
     name, or the last one, as in ``cam1_0000``, ``0000_cam1`` and ``0000``.
 
-    Of several that change, it is the one with the most values, then with the fewest gaps, then the
-    last one. It must order the frames as their names do: that of a time code does not, because it
-    begins again with every second. A single name without a number has the number 0.
+    Of several that change, it is the one with the most values, then the last one. It must order the
+    frames as their names do: that of a time code does not, because it begins again with every
+    second. A single name without a number has the number 0.
 
     Args:
         folder: the folder of the frames, for messages.
@@ -33,7 +32,7 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     if not columns:
         name = names[numbers.index([])]
         raise ValueError(f"{folder}: expected a number in each name, got {name}; rename it.")
-    best = min(columns, key=lambda column: (-len({*column}), _num_gaps(column)))
+    best = max(columns, key=lambda column: len({*column}))
     in_order = sorted(zip(map(natural_key, names), best, names, strict=True))
     for (_, number, name), (_, next_number, next_name) in pairwise(in_order):
         if number >= next_number:
@@ -87,8 +86,3 @@ def check_counting(folder: Path, numbers: Sequence[int], names: Sequence[str]) -
             f"{names[uneven[0]]} followed by {names[uneven[0] + 1]}, and steps of {least} between "
             "others; rename the images to 0000, 0001, ... if their names are times."
         )
-
-
-def _num_gaps(numbers: Sequence[int]) -> int:
-    step = math.gcd(*(number - numbers[0] for number in numbers)) or 1
-    return (max(numbers) - min(numbers)) // step
