@@ -256,12 +256,8 @@ def _probe(path: Path) -> _Probe:
         num_frames = stream.frames - hidden if stream.frames else 0
         if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
             num_frames = num_held  # headers also count what edit lists and null frames hide
-        # AVI stores decoding times alone; for some codecs, FFmpeg derives the times of display.
-        are_decoding_times = (
-            container.format.name == "avi"
-            and stream.codec_context.has_b_frames
-            and shown == sorted(shown, key=lambda time: time or 0)
-        )
+        # AVI stores decoding times alone.
+        are_decoding_times = container.format.name == "avi" and stream.codec_context.has_b_frames
         fps = float(stream.guessed_rate or 0)
         is_deep = first.format.components[0].bits == 16
         return _Probe(
