@@ -38,18 +38,12 @@ def failures_in(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if isinstance(error, SyntaxError):  # which has no frame in the file
-            line = error.lineno
-            reason = error.msg
-        else:
-            # The file name of a frame is absolute.
-            frames = extract_tb(error.__traceback__)
-            file = path.resolve()
-            lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file]
-            line = lines[-1] if lines else None
-            reason = str(error)
-        place = f"{path}, line {line}" if line else str(path)
+        # The file name of a frame is absolute. A syntax error has no frame, but names its line.
+        frames = extract_tb(error.__traceback__)
+        file = path.resolve()
+        lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file]
+        place = f"{path}, line {lines[-1]}" if lines else str(path)
         kind = type(error).__name__
         raise ValueError(
-            f"{place}: {kind}: {reason.rstrip('.')}; correct the scene file."
+            f"{place}: {kind}: {str(error).rstrip('.')}; correct the scene file."
         ) from error

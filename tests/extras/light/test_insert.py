@@ -131,7 +131,7 @@ def test_selected__refuses_missing_frames(stream):
     [
         ("missing.py", None, "expected a scene to insert, FILE.xml or FILE.py, got none"),
         ("a.json", "{}", "FILE.xml or FILE.py, got '.json'"),
-        ("syntax.py", "def build(:", "syntax.py, line 1: SyntaxError"),
+        ("syntax.py", "def build(:", r"syntax.py: SyntaxError: .*\(syntax.py, line 1\)"),
         ("empty.py", "", r"must define `build\(frame, time\) -> dict`"),
         (
             "fails.py",

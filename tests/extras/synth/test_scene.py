@@ -54,7 +54,7 @@ def test_rig__test_view_is_at_the_centre():
         ("def build(seed): return {}", r"must be a .*Scene, got a dict; return Scene"),
         (
             "\ndef build(seed:\n",
-            "scene.py, line 2: SyntaxError: '.' was never closed; correct the scene",
+            r"scene.py: SyntaxError: '.' was never closed \(scene.py, line 2\); correct the scene",
         ),
         (
             "import mitsuba as mi\ndef build(seed):\n    return mi.Bitmap('no.png')",
