@@ -177,10 +177,10 @@ def aligned_folders(folders: Mapping[str, Path]) -> dict[str, FolderReader]:
     step = math.gcd(*steps.tolist()) or 1
     if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
         gap = int(np.argmax(steps))
-        file = next(f[numbers[gap + 1]] for f in clips.values() if numbers[gap + 1] in f)
+        place = next(iter(folders.values())).parent
         raise ValueError(
-            f"{file}: expected numbers without large gaps, got this one after {numbers[gap]}; "
-            "remove or renumber it."
+            f"{place}: expected numbers of images without large gaps, got {numbers[gap + 1]} after "
+            f"{numbers[gap]}; remove or renumber the image."
         )
     timestamps = range(numbers[0], numbers[-1] + 1, step)
     readers: dict[str, FolderReader] = {}

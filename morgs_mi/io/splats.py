@@ -127,7 +127,7 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         header = file.read(4096).partition(b"end_header")[0]
     if suffix == ".splat":
         read = _read_splat
-    elif suffix == ".compressed.ply" or b"packed_position" in header:
+    elif b"packed_position" in header:
         read = read_compressed_ply
     else:
         read = read_ply

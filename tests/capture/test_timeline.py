@@ -388,7 +388,7 @@ def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path):
     (path / "cam_2" / "0003.png").rename(path / "cam_2" / f"{number}.png")
     with pytest.raises(
         ValueError,
-        match=rf"cam_2/{number}.png: expected numbers without .* this one after 3",
+        match=rf"c: expected numbers of images without .*, got {number} after 3",
     ):
         load_capture(path, reading=ReadConfig(gaps=True))
 
