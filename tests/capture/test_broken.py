@@ -181,14 +181,6 @@ NERFSTUDIO = {
         transforms(lambda m: [m.update(camera_angle_x=0), *(f.pop("fl_x") for f in m["frames"])]),
         r"frame 0 .*: `camera_angle_x` must be a number in \(0, 3.14159\), got 0",
     ),
-    "split without frame": (
-        transforms(lambda m: m.update(test_filenames=["cam2.png", "gone.png"])),
-        "the splits must name images by their `file_path`, got cam2.png, gone.png; correct",
-    ),
-    "split is a number": (
-        transforms(lambda m: m.update(test_filenames=3)),
-        "transforms.json: `test_filenames` must be a list, got 3; export it again",
-    ),
     "moving camera": (
         transforms(lambda m: [f.update(time=i / 2) for i, f in enumerate(m["frames"])]),
         "`time` must have as many values as each camera has images, 1, because cameras are fixed, "

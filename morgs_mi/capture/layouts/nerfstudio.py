@@ -5,8 +5,7 @@ Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera ->
 up, z backward. Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), lens coefficients and `mask_path`
 are keys of the file or of a frame; the frame's take precedence. `w` and `h` may be missing. Pixel
 centres lie at +0.5, as in `Camera`. World units are the units of the matrices: `applied_transform`
-and `applied_scale` are not undone. `train_filenames`, `val_filenames` and `test_filenames` split
-the images by their `file_path`; of the two files, the second has the held-out images.
+and `applied_scale` are not undone. Of the two files, the second has the held-out images.
 """
 
 from __future__ import annotations
@@ -44,11 +43,9 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _INTRINSICS = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 _KEYS = {
     *_INTRINSICS,
     *_DISTORTION,
-    *_SPLITS,
     "frames",
     "time",
     "file_path",
@@ -99,11 +96,6 @@ class _Image(CalibratedImage):
     """One entry of `frames`."""
 
     time: str = ""
-
-    @property
-    def place(self) -> PurePosixPath:
-        """Place of `file_path`, which is the camera's name."""
-        return _place(self.name)
 
 
 def _place(name: Any) -> PurePosixPath:
@@ -241,39 +233,17 @@ def _read_images(
     return meta, images
 
 
-def _read_splits(source: Path, meta: JsonObject) -> dict[str, set[PurePosixPath]]:
-    """Return the places of the images of each split that a file has."""
-    splits = {}
-    for key in _SPLITS:
-        names = meta.get(key)
-        if names is not None:
-            is_list = isinstance(names, list)
-            require(is_list, source, f"`{key}` must be a list", repr(names)[:80], "export it again")
-            splits[key] = set(map(_place, names))
-    return splits
-
-
 def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
     source, *others = _sources(path)
     if unread := sorted({*path.glob("transforms*.json")} - {source, *others}):
         _LOG.warning("%s: not used: %s.", path, few([file.name for file in unread]))
     meta, images = _read_images(path, source, clips)
-    splits = _read_splits(source, meta)
+    names = {image.name for image in images}
     for other in others:
-        splits["train_filenames"] = {image.place for image in images}
         images += _read_images(path, other, clips)[1]
     require(
         images, source, "`frames` must have an entry for each camera", "none", "export it again"
-    )
-    places = {image.place for image in images}
-    unknown = sorted(set().union(*splits.values()) - places)
-    require(
-        not unknown,
-        source,
-        "the splits must name images by their `file_path`",
-        few(unknown, 4),
-        "correct or remove these names",
     )
     calibration = match_clips(path, source, clips, images)
     times = {image.time for image in images}
@@ -286,31 +256,13 @@ def _read_calibration(path: Path) -> Calibration:
         len(times),
         "record by fixed cameras, or remove `time` if nothing moves",
     )
-    test = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
-    training = splits.get("train_filenames", places - test)
-    held_out = []
-    mixed = []
-    for view in calibration.views:
-        is_trained = {_place(image.name) in training for image in view.images}
-        if is_trained == {False}:
-            held_out.append(view.name)
-        elif False in is_trained:
-            mixed.append(view.name)
-    if mixed:
-        _LOG.warning(
-            "%s: all images of %s are trained on, because the training split has some of them.",
-            source,
-            few(mixed),
+    if others:
+        held_out = tuple(
+            view.name
+            for view in calibration.views
+            if names.isdisjoint(image.name for image in view.images)
         )
-    require(
-        len(held_out) < len(calibration.views),
-        source,
-        "the splits must leave a camera to train on",
-        "none",
-        "add one to the training split",
-    )
-    if splits:
-        calibration = replace(calibration, held_out=tuple(held_out))
+        calibration = replace(calibration, held_out=held_out)
     if file := meta.get("ply_file_path"):
         points, colors = read_points_ply(path / _place(file))
         calibration = replace(calibration, points=points, point_colors=colors)

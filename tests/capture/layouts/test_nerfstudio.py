@@ -131,47 +131,6 @@ def test_nerfstudio__masks_what_any_mask_of_a_camera_has_black(tmp_path):
         load_capture(path)
 
 
-SPLITS = {
-    "test": ({"test_filenames": ["images/cam2.png"]}, (1,)),
-    "validation and test": (
-        {"val_filenames": ["images/cam1.png"], "test_filenames": ["./images/cam2.png"]},
-        (0, 1),
-    ),
-    "other than training": (
-        {
-            "train_filenames": ["images/cam1.png"],
-            "test_filenames": ["images\\cam10.png", "images/cam2.png"],
-        },
-        (1, 2),
-    ),
-    "only training": ({"train_filenames": ["images/cam10.png"]}, (0, 1)),
-    "trained and tested": (
-        {
-            "train_filenames": [f"images/{n}.png" for n in NAMES],
-            "val_filenames": ["images/cam2.png"],
-        },
-        (),
-    ),
-    "none": ({"test_filenames": []}, ()),
-}
-
-
-@pytest.mark.parametrize(("lists", "views"), SPLITS.values(), ids=SPLITS)
-def test_nerfstudio__holds_out_the_views_of_its_splits(tmp_path, lists, views):
-    path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
-    assert READER.read(path).held_out == tuple(NAMES[v] for v in views)
-    assert load_capture(path).test_views == views
-    assert load_capture(path, test_view=None).test_views == ()
-
-
-def test_nerfstudio__needs_a_view_to_train_on(tmp_path):
-    path = photos(tmp_path / "a", change=lambda meta: meta.update(train_filenames=[]))
-    with pytest.raises(
-        ValueError, match=r"transforms.json: the splits must leave a camera to train on, got none"
-    ):
-        load_capture(path)
-
-
 def synthetic(path, parts, cameras, suffix=""):
     """Write photos and the files of NeRF's synthetic scenes, which state an angle of view and no
     size; `parts` are the names of the folders, of a camera each.
@@ -296,17 +255,6 @@ def test_nerfstudio__holds_out_a_camera_of_a_recording_in_one_folder(tmp_path, c
     assert caplog.messages == []
 
 
-def test_nerfstudio__names_cameras_that_its_splits_divide(tmp_path, caplog):
-    path = flat(tmp_path / "a", "{camera}_{time}.png")
-    names = [entry["file_path"] for entry in read_json(path / "transforms.json")["frames"]]
-    edit(path, lambda meta: meta.update(train_filenames=names[:3], test_filenames=names[3:]))
-    assert load_capture(path).test_views == (2,)
-    assert caplog.messages == [
-        f"{path / 'transforms.json'}: all images of b_0 are trained on, because the training split "
-        "has some of them."
-    ]
-
-
 @pytest.mark.parametrize(
     ("gone", "message"),
     [
@@ -382,6 +330,7 @@ def test_nerfstudio__names_keys_that_it_does_not_understand_once(tmp_path, caplo
             applied_transform=[],
             applied_scale=1.0,
             rolling_shutter=[0, 0, 1],
+            test_filenames=[],
         )
         for frame in meta["frames"]:
             frame.update(sharpness=9.5, colmap_im_id=3, depth_file_path="d.png", k5=0.1)
@@ -389,5 +338,6 @@ def test_nerfstudio__names_keys_that_it_does_not_understand_once(tmp_path, caplo
     path = photos(tmp_path / "a", change=change)
     load_capture(path)
     assert caplog.messages == [
-        f"{path / 'transforms.json'}: not understood and not used: k5, rolling_shutter."
+        f"{path / 'transforms.json'}: not understood and not used: k5, rolling_shutter, "
+        "test_filenames."
     ]
