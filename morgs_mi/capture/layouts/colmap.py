@@ -28,7 +28,6 @@ from morgs_mi.capture.layouts.calibration import (
     required_clips,
 )
 from morgs_mi.capture.layouts.colmap_files import (
-    count_images,
     model_file,
     read_cameras,
     read_images,
@@ -68,14 +67,11 @@ def find_models(folder: Path) -> list[Path]:
     """Return the folders of the COLMAP models in a capture, of which the first is used.
 
     They are numbered folders of `sparse` or `sparse` itself, likewise of `colmap/sparse`, or the
-    capture itself. COLMAP writes several models, in any order, if it cannot connect all images: the
-    one of most images is the first.
+    capture itself. COLMAP writes several models if it cannot connect all images.
     """
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
         numbered = sorted(place.glob("[0-9]*"), key=lambda model: natural_key(model.name))
         models = [model for model in numbered if model.name.isdecimal() and _holds_model(model)]
-        if len(models) > 1:  # counting reads all images of a model
-            models.sort(key=count_images, reverse=True)
         if models or _holds_model(place):
             return models or [place]
     # In a capture itself, a single name may have another meaning.
@@ -194,14 +190,12 @@ def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
     folder, *others = find_models(path)
     if others:
-        counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
         _LOG.warning(
-            "%s: the largest of %d models, %s with %d images, is used; %s.",
+            "%s: the first of %d models, %s, is used; if another has more images, move this one "
+            "out of the capture.",
             folder.parent,
             1 + len(others),
             folder.name,
-            count_images(folder),
-            counts,
         )
     model = read_colmap(folder)
     calibration = match_clips(path, folder, clips, model.images)

@@ -25,7 +25,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -73,13 +73,6 @@ def read_points(path: Path) -> Iterator[list[float]]:
     `points3D.txt` [6].
     """
     return _binary_points(path) if path.suffix == ".bin" else _text_points(path)
-
-
-def count_images(folder: Path) -> int:
-    """Return the number of images in the COLMAP model in `folder`; 0 if it cannot be read."""
-    with suppress(OSError, ValueError):
-        return sum(1 for _ in read_images(model_file(folder, "images")))
-    return 0
 
 
 # ---- text ----------------------------------------------------------------------------------------

@@ -204,30 +204,18 @@ def test_read_colmap__keeps_the_spaces_of_names_and_reads_aligned_columns(tmp_pa
     assert set(load_capture(tmp_path).names) == set(names)
 
 
-@pytest.mark.parametrize("kind", ["txt", "bin"])
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
-def test_find_models__takes_the_model_of_most_images(tmp_path, caplog, kind, place):
+def test_find_models__takes_the_first_model_and_names_the_choice(tmp_path, caplog, place):
     names = ("cam1", "cam2", "cam3")
-    for number, count in (("0", 1), ("1", 3), ("10", 2), ("backup", 3)):
-        folder = tmp_path / place / number
-        write_colmap(folder, rig(names)[:count])
-        if kind == "bin":
-            as_binary(folder)
+    for number, count in (("2", 2), ("10", 3), ("backup", 3)):
+        write_colmap(tmp_path / place / number, rig(names)[:count])
     (tmp_path / place / "._1").touch()
     videos(tmp_path, names)
-    assert load_capture(tmp_path).names == names
-    assert (
-        f"{place}: the largest of 3 models, 1 with 3 images, is used; 10 has 2, 0 has 1."
-        in caplog.text
-    )
+    assert load_capture(tmp_path).names == names[:2]
+    assert f"{place}: the first of 2 models, 2, is used; if another has more" in caplog.text
 
 
-def test_find_models__takes_the_first_of_equal_models_and_the_only_one(tmp_path):
-    for number in ("1", "2"):
-        write_colmap(tmp_path / "sparse" / number, rig(("cam1", "cam2")))
-    assert find_models(tmp_path)[0] == tmp_path / "sparse" / "1"
-    (tmp_path / "sparse/1/images.txt").write_text("broken\n")
-    assert find_models(tmp_path)[0] == tmp_path / "sparse" / "2"
-    write_colmap(tmp_path / "a/sparse", rig(("cam1",)))
-    write_colmap(tmp_path / "a/sparse/backup", rig(("cam1", "cam2")))
-    assert find_models(tmp_path / "a")[0] == tmp_path / "a/sparse"
+def test_find_models__prefers_a_model_in_the_folder_to_others_beside_it(tmp_path):
+    write_colmap(tmp_path / "sparse", rig(("cam1",)))
+    write_colmap(tmp_path / "sparse/backup", rig(("cam1", "cam2")))
+    assert find_models(tmp_path) == [tmp_path / "sparse"]
