@@ -28,8 +28,6 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
-import imagesize
-
 from morgs_mi.io.clip_readers import Clip, open_frames
 from morgs_mi.io.listing import VIDEO_SUFFIXES, by_stem, images_in, listed
 from morgs_mi.io.numbering import check_numbering, frame_numbers, natural_key
@@ -44,10 +42,12 @@ EXAMPLE = (
 )
 """The layout of a recording in images, for messages."""
 
-# Folders of other images than colours, folders without clips, and folders with images that do not
-# belong to a camera of their name.
-_OTHER_IMAGES = {"alpha", "depth", "depths", "infrared", "ir", "mask", "normal", "normals"}
-_NOT_CLIPS = {"sparse", "truth", "masks", "seg", *_OTHER_IMAGES}
+# Folders of other images than colours and folders without clips, and folders with images that do
+# not belong to a camera of their name.
+_NOT_CLIPS = {
+    *("alpha", "depth", "depths", "infrared", "ir", "mask", "masks", "normal", "normals", "seg"),
+    *("sparse", "truth"),
+}
 # Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
 _COPIES = r"images_[0-9]+"
 _COLORS = ("images", "color", "rgb")
@@ -58,11 +58,8 @@ _USUAL = {"images", "videos"}
 
 def find_clips(path: Path) -> Mapping[str, Clip]:
     """Return each camera's video, folder of images or photo by the camera's name, in numerical
-    order; errors of `clips_by_camera`.
+    order; errors of `clips_by_camera`. Folders of other images than colours are not looked at.
     """
-    others = {f.name for place in (path, *_places(path)) for f in listed(place) if f.is_dir()}
-    if others := sorted(others & _OTHER_IMAGES):
-        _LOG.warning("%s: only images of colours are used, not those in %s.", path, few(others))
     return clips_by_camera(path) or photos(path) or clips_by_rig(path)
 
 
@@ -232,11 +229,7 @@ def size_of_clip(clip: Clip) -> tuple[int, int]:
     file = clip if isinstance(clip, Path) else clip[0]
     if file.is_dir():
         file = images_in(file)[0]
-    is_video = file.suffix.lower() in VIDEO_SUFFIXES
-    size = (-1, -1) if is_video else imagesize.get(file)
-    if min(size) > 0:
-        return size
-    reader = open_frames(file if is_video else (file,))  # the header does not show the size
+    reader = open_frames(file if file.suffix.lower() in VIDEO_SUFFIXES else (file,))
     return reader.width, reader.height
 
 
