@@ -126,9 +126,7 @@ def test_align_numbers__are_no_times(tmp_path, reading):
 def test_align_numbers__shifts_videos_beside_them(tmp_path):
     """A video begins with the first number."""
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
-    layouts.write_poses_bounds(
-        path / "poses_bounds.npy", layouts.rig(("a", "b", "v")), np.array([[1, 9]] * 3)
-    )
+    layouts.write_poses_bounds(path / "poses_bounds.npy", layouts.rig(("a", "b", "v")))
     images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), t, np.uint8) for t in range(8)]
     write_video(path / "v.mkv", images, 30)
     assert frame_numbers(load_capture(path, reading=TRIM)) == [[t, t, t] for t in range(2, 6)]

@@ -9,14 +9,12 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 import pytest
 
 import morgs_mi
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.playback.visualise import write_png
@@ -53,8 +51,7 @@ def write_images(recording, name):
 
 def dynerf(recording):
     write_images(recording, "dynerf/SCENE/{camera}/images/{frame:04d}.png")
-    bounds = np.tile([1.0, 9.0], (CAMERAS, 1))
-    write_poses_bounds("dynerf/SCENE/poses_bounds.npy", recording.cameras, bounds)
+    layouts.write_poses_bounds("dynerf/SCENE/poses_bounds.npy", recording.cameras)
 
 
 def multipleview(recording):

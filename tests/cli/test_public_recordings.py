@@ -11,6 +11,7 @@ import pytest
 
 import morgs_mi
 from morgs_mi.platform.bounded import read_json
+from tests.scenes.captures import write_poses_bounds
 
 PAGE = Path(__file__).parents[2] / "docs/experiments/real.md"
 FRAMES = 3
@@ -29,6 +30,7 @@ def stand_in(path, width, height, number):
             cameras=8, frames=FRAMES, width=width, height=height, seed=3, lossless=False
         ),
     )
+    write_poses_bounds(path / "poses_bounds.npy", morgs_mi.load_capture(path).cameras)
     for extra in ("sparse", "truth"):
         shutil.rmtree(path / extra)
     (path / "capture.json").unlink()

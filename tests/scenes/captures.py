@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
@@ -95,10 +94,21 @@ def write_timed_video(
         container.mux(stream.encode())
 
 
+def write_poses_bounds(path, cameras):
+    """Write cameras with one focal length and a centred principal point as LLFF does."""
+    rows = []
+    for camera in cameras:
+        right, down, forward = camera.rotation
+        size = [camera.height, camera.width, camera.K[0, 0]]
+        pose = np.stack([down, right, -forward, camera.position, size], axis=1)
+        rows.append([*pose.ravel(), 1, 9])
+    np.save(path, np.array(rows))
+
+
 def n3dv(path, names=("cam00", "cam02", "cam11"), clips=videos):
     path.mkdir(parents=True)
     clips(path, names)
-    write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * len(names))
+    write_poses_bounds(path / "poses_bounds.npy", rig(names))
     return path
 
 

@@ -2,14 +2,13 @@
 
 One row [17] per camera, in the order of the existing videos by number: a 3x5 matrix in row-major
 order with the columns down, right and backward axis of the camera, its centre (all in the world)
-and (height, width, focal length); then the nearest and farthest depth. The principal point is the
-image centre.
+and (height, width, focal length); then the nearest and farthest depth, which are not used. The
+principal point is the image centre.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +18,10 @@ from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.core.camera import Camera, intrinsic_matrix, pose_at, rigid
 from morgs_mi.platform.bounded import read_array
 from morgs_mi.platform.checks import errors_at
-from morgs_mi.platform.files import atomic_path
 
 
-def read_poses_bounds(
-    path: str | Path, names: Sequence[str]
-) -> tuple[tuple[Camera, ...], np.ndarray]:
-    """Return one camera per name, and their depth bounds [C, 2] in world units.
+def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[Camera, ...]:
+    """Return one camera per name.
 
     Args:
         path: the file.
@@ -53,35 +49,7 @@ def read_poses_bounds(
             viewmat = rigid("columns in the order down, right, back", pose)
             K = intrinsic_matrix(focal, focal, 0.5 * width, 0.5 * height)
             cameras.append(Camera(K, viewmat, round(width), round(height), name))
-    return tuple(cameras), rows[:, 15:].astype(np.float64)
-
-
-def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.ndarray) -> None:
-    """Write the cameras, in the order of their sorted videos, with their depth bounds [C, 2].
-
-    Raises:
-        ValueError: a camera has two focal lengths or an off-centre principal point, which the
-            format cannot represent.
-        OSError: the file could not be written.
-    """
-    rows = []
-    for camera, near_far in zip(cameras, bounds, strict=True):
-        f = camera.K[0, 0]
-        K = intrinsic_matrix(f, f, 0.5 * camera.width, 0.5 * camera.height)
-        if not np.allclose(camera.K, K, rtol=1e-6, atol=1e-3):
-            raise ValueError(
-                f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
-                f"centred principal point, got K={camera.K.tolist()}; use write_colmap()."
-            )
-        right, down, forward = camera.rotation
-        hwf = [camera.height, camera.width, f]
-        pose = np.stack([down, right, -forward, camera.position, hwf], axis=1)
-        rows.append([*pose.ravel(), *near_far])
-    # np.save() into a file does not report that the disk has no room for the last few kB.
-    data = BytesIO()
-    np.save(data, np.array(rows))
-    with atomic_path(path, "write_poses_bounds()") as partial:
-        partial.write_bytes(data.getvalue())
+    return tuple(cameras)
 
 
 def _read_calibration(path: Path) -> Calibration:
@@ -94,7 +62,7 @@ def _read_calibration(path: Path) -> Calibration:
     if (len(clips),) != count == (len(by_frame := clips_by_frame(path)),):
         check_frames(path, next(iter(by_frame.values())))
         clips = by_frame
-    cameras, _ = read_poses_bounds(source, list(clips))
+    cameras = read_poses_bounds(source, list(clips))
     pairs = zip(cameras, clips.values(), strict=True)
     return Calibration(tuple(CalibratedView(camera, clip=clip) for camera, clip in pairs))
 

@@ -17,7 +17,6 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
@@ -62,14 +61,12 @@ def synthesize(
     overwrite: bool = False,
     progress: StepReport | None = None,
 ) -> Path:
-    """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground
-    truth.
+    """Path-trace a moving scene into a multi-view capture with exact ground truth.
 
-    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players, ``poses_bounds.npy``, a
-    COLMAP text model ``sparse/0`` with points as from structure from motion, ``capture.json`` and
-    ``truth/`` (see `ground_truth` and `disturbances`). ``cam00`` is the central camera of the rig
-    and the held-out test view, as in N3DV. With lens distortion there is no ``poses_bounds.npy``,
-    which cannot represent it. The folder is written atomically.
+    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players, a COLMAP text model
+    ``sparse/0`` with points as from structure from motion, ``capture.json`` and ``truth/`` (see
+    `ground_truth` and `disturbances`). ``cam00`` is the central camera of the rig and the held-out
+    test view, as in N3DV. The folder is written atomically.
 
     Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each
     camera.
@@ -341,8 +338,7 @@ def _sample_tracks(
 
 
 def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
-    """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training
-    views.
+    """Write the cameras as a COLMAP model with points from the training views.
 
     The points have the colours of the `clips`, one per camera.
     """
@@ -350,7 +346,6 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     rng = np.random.default_rng([rig.config.seed, 2])
     points = []
     colors = []
-    bounds = []
     for index, camera in enumerate(rig.cameras):
         view = camera.view
         tracer.set_time(camera.disturbance.time_offset / rig.config.fps)
@@ -360,8 +355,6 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
         pixels = np.flatnonzero((surface.ids >= 0) & (lens is None or lens.mask))
         positions = surface.pick(pixels).positions
         _, depths = view.project(positions)
-        # LLFF's percentiles, which readers of the file expect.
-        bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
             continue  # the held-out view must not contribute points or colours
         most = _NUM_SFM_POINTS // (len(rig.cameras) - 1)
@@ -373,8 +366,6 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
         image = next(open_frames(clips[index]).frames(0, 1))
         image = image if lens is None else lens(image)
         colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)
-    if not rig.config.disturbances.distortion:
-        write_poses_bounds(folder / "poses_bounds.npy", rig.views, np.array(bounds))
     write_colmap(
         folder / "sparse" / "0", rig.views, np.concatenate(points), np.concatenate(colors), lenses
     )

@@ -16,7 +16,6 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts import reader_registry
 from morgs_mi.capture.layouts.calibration import CalibratedView, Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.rig import moved
@@ -116,7 +115,7 @@ def test_colmap__finds_models_in_several_places(tmp_path, place):
 def test_find_reader__follows_the_order_of_precedence(tmp_path):
     """COLMAP, Nerfstudio, Dynamic 3D Gaussians, poses_bounds; binary before text."""
     path = layouts.nerfstudio(tmp_path / "a")
-    write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
+    layouts.write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")))
     assert load_capture(path).layout == "Nerfstudio"
     layouts.colmap_text(
         path / "sparse", rig(("cam1", "cam2")), "PINHOLE", [[50.0, 50, 31, 23]], shared=True
@@ -128,7 +127,7 @@ def test_find_reader__follows_the_order_of_precedence(tmp_path):
     assert load_capture(path).cameras[0].K[0, 0] == 60
     meta = layouts.dynamic3dgs(tmp_path / "b")
     layouts.videos(meta, ("cam1",))
-    write_poses_bounds(meta / "poses_bounds.npy", rig(("cam1",)), [[1, 9]])
+    layouts.write_poses_bounds(meta / "poses_bounds.npy", rig(("cam1",)))
     assert load_capture(meta).layout == "Dynamic 3D Gaussians"
     (meta / "transforms.json").write_text((path / "transforms.json").read_text())
     layouts.videos(meta, ("cam1", "cam2", "cam10"))
