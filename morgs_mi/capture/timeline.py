@@ -4,8 +4,8 @@ A timestamp t = 0, 1, ... is a frame of the recording. It is shown by frame k of
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
-Folders of images have an o and r by the numbers of their images, too. The numbers are times: images
-with the same number are simultaneous.
+Numbers of images are times: images with the same number are simultaneous, and folders with
+different numbers are refused, or aligned by `open_clips`.
 
 If k is not whole, the nearest frame shows the timestamp; in a clip of variable frame rate, k is a
 position on its regular clock. If only o is not whole, this frame is always later by the same time,
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,7 +25,7 @@ import numpy as np
 
 from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.io.clip_readers import FrameReader
-from morgs_mi.platform.checks import composed, few
+from morgs_mi.platform.checks import composed, few, require
 from morgs_mi.platform.config import config_class
 
 _LOG = logging.getLogger(__name__)
@@ -140,8 +140,7 @@ def timeline(
     check_names(path, "offset", config.offset, [*readers])
     config = replace(config, offset={composed(name): o for name, o in config.offset.items()})
     exact, fps = _clocks(readers, config, fps)
-    exact, fps, notes = _by_numbers(path, exact, config, fps)
-    notes += _notes_of_clips(readers)
+    notes = [*_notes_of_numbers(path, readers, config), *_notes_of_clips(readers)]
     if not config.offset:
         notes += _time_codes(readers)
     for note in notes:
@@ -203,47 +202,30 @@ def _clocks(
     return clocks, lowest
 
 
-def _by_numbers(
-    path: Path, clocks: _Clocks, config: ReadConfig, fps: float
-) -> tuple[_Clocks, float, list[str]]:
-    """Return the clocks of clips by the numbers of their images, too, the number of timestamps per
-    second, and a sentence for each assumption.
+def _notes_of_numbers(
+    path: Path, readers: Mapping[str, FrameReader], config: ReadConfig
+) -> list[str]:
+    """Return a sentence if images with different numbers are paired by an offset.
+
+    Raises:
+        ValueError: the numbers of the cameras' images differ without one.
     """
-    folders = {name: clock.reader.numbers for name, clock in clocks.items()}
-    numbers = {name: clip for name, clip in folders.items() if clip}
+    numbers = {name: reader.numbers for name, reader in readers.items() if reader.numbers}
     is_clip = any(len(clip) > 1 for clip in numbers.values())
     if not is_clip or len({(clip[0], clip.step) for clip in numbers.values()}) < 2:
-        return clocks, fps, []
+        return []
     table = ", ".join(f"{name} {_range(clip)}" for name, clip in numbers.items())
-    if config.offset and not config.trim:
-        note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
-        return clocks, fps, [note]
-    common = sorted(set.intersection(*map(set, numbers.values())))
-    if not config.trim or not common:
-        remedy = (
-            f"the {len(common)} common ones with --trim, all numbers with --gaps, which leaves out "
-            "the cameras that lack an image, or "
-        )
-        raise ValueError(
-            f"{path}: images with the same number must be simultaneous and all cameras must have "
-            f"the same numbers, got {table}; use {remedy if common else ''}the positions of the "
-            f"images in place of their numbers with --offset {next(iter(numbers))} 0."
-        )
-    note = (
-        f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
-        "all cameras have."
+    require(
+        config.offset,
+        path,
+        "images with the same number must be simultaneous and all cameras must have the same "
+        "numbers",
+        table,
+        "move the images away whose numbers not all cameras have, leave out the cameras that lack "
+        "an image with --gaps, or use the positions of the images in place of their numbers with "
+        f"--offset {next(iter(numbers))} 0",
     )
-    steps = [clip.step for clip in numbers.values()]
-    # Other clips start with the first of these numbers.
-    first = min(clip[0] for clip in numbers.values())
-    aligned = {}
-    for name, clock in clocks.items():
-        clip = numbers.get(name, range(first, first + 1, min(steps)))
-        offset = clock.offset + (common[0] - clip[0]) / clip.step * clock.rate
-        rate = clock.rate * math.lcm(*steps) / clip.step
-        aligned[name] = replace(clock, offset=offset, rate=rate)
-    # The time between two timestamps, in frames of the clip with the most frames per time.
-    return aligned, fps / (math.lcm(*steps) / min(steps)), [note]
+    return [f"Images are aligned by their positions and --offset, not by their numbers: {table}."]
 
 
 def _notes_of_clips(readers: Mapping[str, FrameReader]) -> list[str]:
@@ -287,12 +269,9 @@ def _variable_rate(positions: np.ndarray, fps: float, frame_indices: np.ndarray)
     )
 
 
-def _range(numbers: Sequence[int]) -> str:
-    if len(numbers) == 1:
-        return str(numbers[0])
+def _range(numbers: range) -> str:
     text = f"{numbers[0]} to {numbers[-1]}"
-    step = numbers[1] - numbers[0]
-    return text if step == 1 else f"{text} by {step}"
+    return text if numbers.step == 1 else f"{text} by {numbers.step}"
 
 
 def _spread(clips: Mapping[str, ClipTimes], clocks: _Clocks) -> float:
