@@ -31,7 +31,7 @@ from morgs_mi.io.clip_readers import FrameReader, open_clips
 from morgs_mi.io.images import ImageOrError
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.platform.bounded import JsonObject
-from morgs_mi.platform.checks import check_number, check_points, composed, few, quantity
+from morgs_mi.platform.checks import check_number, check_points, composed, quantity
 from morgs_mi.platform.files import CAPTURE
 
 _LOG = logging.getLogger(__name__)
@@ -362,7 +362,7 @@ def load_capture(
     every = layout.read(path).centred(path)
     calibration = every.without(path, reading.without)
     readers = open_clips(calibration.clips, reading.gaps, settings.white)
-    calibrated = _at_clip_sizes(path, calibration.views, readers)
+    calibrated = _at_clip_sizes(calibration.views, readers)
     common = timeline(path, readers, reading, max_frames, settings.fps)
     readouts = _readouts(path / CAPTURE, settings.readout, every.names)
     _check_downscale(downscale, calibrated)
@@ -417,15 +417,14 @@ def _check_arguments(path: Path, downscale: float, max_frames: int | None) -> No
 
 
 def _at_clip_sizes(
-    path: Path, views: Sequence[CalibratedView], readers: Mapping[str, FrameReader]
+    views: Sequence[CalibratedView], readers: Mapping[str, FrameReader]
 ) -> list[CalibratedView]:
-    """Return the views with cameras at the sizes of their clips, with a warning if a size differs.
+    """Return the views with cameras at the sizes of their clips, which may be scaled versions.
 
     Raises:
         ValueError: a clip has another aspect ratio than its camera.
     """
     recorded = []
-    scaled = []
     for view in views:
         camera = view.camera
         reader = readers[view.name]
@@ -439,16 +438,6 @@ def _at_clip_sizes(
                 "the size of the images."
             )
         recorded.append(replace(view, camera=camera.resized(width, height)))
-        if (width, height) != camera.size:
-            scaled.append(recorded[-1].camera)
-    if scaled:
-        _LOG.warning(
-            "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
-            "intrinsics are scaled.",
-            path,
-            few([camera.name for camera in scaled]),
-            *scaled[0].size,
-        )
     return recorded
 
 
