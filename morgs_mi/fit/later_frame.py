@@ -196,15 +196,15 @@ class _ResidualFit:
             views = problem.views
             self._later_steps = LaterSteps(views, self._optimizer, config.objective, motion)
         self._groups = view_groups(problem.views, _MOST_SPLATS // len(self._previous))
-        self._lists: Mapping[int, ViewLists] = {}  # of the epoch
+        self._views = problem.views  # with lists, which the steps of an epoch share
 
-    def _recorded_steps(self) -> RecordedSteps | None:
-        """Return the steps with the present lists as recordings; None if these do not exist."""
+    def _recorded_steps(self, lists: Mapping[int, ViewLists]) -> RecordedSteps | None:
+        """Return the steps with some lists as recordings; None if these do not exist."""
         if self._later_steps is None:
             return None
         problem = self._problem
         num_gaussians = problem.active.num_gaussians
-        return self._later_steps.of(self._previous, num_gaussians, problem.extent, self._lists)
+        return self._later_steps.of(self._previous, num_gaussians, problem.extent, lists)
 
     def epoch(self, steps: Steps, rates: LearningRates, is_scored: bool) -> dict[str, float]:
         """Make the steps of an epoch, and return their mean losses by name.
@@ -219,14 +219,15 @@ class _ResidualFit:
             # epoch.
             count = len(self._problem.views)
             self._scores = ErrorPerGaussian(len(self.source), count - (count + 3) // 4)
-        self._lists = lists_of_views(self._groups, self._gaussians(), _MARGIN)
+        lists = lists_of_views(self._groups, self._gaussians(), _MARGIN)
+        self._views = {v: replace(view, lists=lists[v]) for v, view in self._views.items()}
         return optimise(
             self._optimizer,
             rates.by_parameter(self._problem.extent),
             self._losses_at,
             replace(steps, observer=self._scores),
             weights_of(self._config.objective),
-            self._recorded_steps(),
+            self._recorded_steps(lists),
         )
 
     def density_round(self, rng: np.random.Generator) -> None:
@@ -262,7 +263,7 @@ class _ResidualFit:
         """Render one view and return its losses by name."""
         problem = self._problem
         objective = self._config.objective
-        view = problem.views[index]
+        view = self._views[index]
         observed = view.observations
         scores = self._scores
         channels = channels_of(observed, objective)
@@ -271,9 +272,8 @@ class _ResidualFit:
         # Motion, confidence and scores must not move opacity and geometry.
         names = channels if features is None else (*channels, "features")
         detached_channels = [name for name in names if name != "color"]
-        drawn = replace(view, lists=self._lists[index])
         image = render_view(
-            gaussians, drawn, channels, features=features, detach_weights=detached_channels
+            gaussians, view, channels, features=features, detach_weights=detached_channels
         )
         if scores is not None and features is not None:
             scores.observe(image, view.target, view.region)
