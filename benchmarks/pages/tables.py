@@ -10,6 +10,7 @@ from benchmarks.pages.results import committed
 from benchmarks.reports import (
     cameras,
     codec,
+    far_cameras,
     field,
     held_out,
     needed,
@@ -197,6 +198,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "clocks": partial(study_table, timing, "timing"),
     "codec": lambda: codec.quality_table(committed("codec_report")["clips"]),
     "demo": demo,
+    "far_cameras": partial(study_table, far_cameras, "far_cameras"),
     "field": lambda: field.field_table(committed("field")["cells"]),
     "frame_times": frame_times,
     "fuzz": fuzz,

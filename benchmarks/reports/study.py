@@ -28,7 +28,8 @@ from morgs_mi.platform.files import json_finite
 
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed
-_PATHS = ("json", "clips", "captures", "pictures")  # options on which no figure depends
+# Options on which no figure depends.
+_PATHS = ("json", "clips", "capture", "captures", "pictures", "silhouettes")
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class ComparedClip:
             recording,
             packets,
             views,
-            _nearest_views(recording, cameras),
+            nearest_views(recording, cameras),
             cameras,
             channels,
             render_config(stream),
@@ -91,7 +91,10 @@ class ComparedClip:
             last = images
 
 
-def _nearest_views(recording: Capture, cameras: Sequence[Camera]) -> dict[int, int]:
+def nearest_views(recording: Capture, cameras: Sequence[Camera]) -> dict[int, int]:
+    """Return, of each held-out view, the training view at the least angle from it, as seen from the
+    scene.
+    """
     depths = scene_depths(cameras, recording.points)
     train_cameras = [cameras[view] for view in recording.train_views]
     angles = {

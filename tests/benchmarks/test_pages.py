@@ -14,7 +14,7 @@ from benchmarks.pages.results import RESULTS, committed
 from benchmarks.pages.tables import TABLES
 from benchmarks.reports import __main__ as reports
 from benchmarks.reports.method_tables import best_rows
-from benchmarks.reports.plots import span
+from benchmarks.reports.plots import grouped, span
 from benchmarks.reports.renderer import relative_times
 
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
@@ -110,6 +110,13 @@ def test_pages__quote_the_committed_results():
         for name in ("basketball", "flame_steak")
     )
     later = committed("frame_speed")["n3dv"]["runs"]["default, 2 epochs"]["seconds"]
+    far = {
+        start: fits for (start,), fits in grouped(committed("far_cameras")["fits"], "start").items()
+    }
+    (person,) = means(far["found"], "psnr_person")
+    alone = [
+        means(far[f"silhouettes, {weight}"], "psnr_person")[0] - person for weight in (0, 0.1, 1)
+    ]
     quotes = f"""
 method: PSNR goes from {demo[0]:.2f} dB to {demo[-1]:.2f} dB.
 method: from {arm[0]:.2f} dB to {arm[-1]:.2f} dB over {len(arm)} frames
@@ -133,6 +140,8 @@ index: {gains[1]} dB more where things move
 method: Motion gains {parts["ml"] - parts["baseline"]:.2f} dB at 2 epochs
 method: additions to the paper gain {parts["ml-mo-mc"] - parts["paper"]:.2f} dB
 renderer: Blocks of 4x4 and 8x8 pixels take {small_blocks:.2f} and {large_blocks:.2f} of the time
+first-frame: The person gains {alone[0]:.1f} dB, with a loss of the opacity against the silhouettes,
+first-frame: of weight 0.1 and 1, {alone[1]:.1f} and {alone[2]:.1f} dB.
 captures: {walk["psnr"]["first"]:.2f} dB in the first frame and {walk["psnr"]["last"]:.2f} dB in the
 captures: {walk["psnr_moving"]:.2f} dB where things move
 captures: A later frame takes {walk["seconds"]["per_later_frame"]:.1f} s

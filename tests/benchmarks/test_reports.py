@@ -26,10 +26,12 @@ CLIP = "--gaussians 60 --steps 3 --frames 3 --width 48 --epochs 1 --clips CLIPS"
 STREAM = "CLIPS/random-1 --out OUT --stream.fit.first-frame-steps 3 --stream.fit.sh-degree 0"
 FIELD = f"{SEED} --epochs 2 --num-gaussians 60 --first-frame-steps 3 --plot OUT/a.png"
 METHOD = "--presets baseline paper --tuned baseline --epochs 2 --key-views 1 --rates 1 2 --seeds 2"
+OUTLINES = "--capture CLIPS/random-1 --silhouettes CLIPS/outlines.json"
 REPORTS = {
     "cameras": f"{SEED} --gaussians 60 --steps 3 --degrees 0 0.5 --disturbances 0 --lens 0.1",
     "codec": f"{STREAM} --qualities 1 --plot OUT/a.png",
     "drift": f"{CLIP} --scenes spheres",
+    "far_cameras": f"{OUTLINES} --downscale 1 --gaussians 60 --steps 3 --fit-seeds 0",
     "field": FIELD,
     "held_out": "CLIPS/fit",
     "method": f"{STREAM} --num-gaussians 60 {METHOD}",
@@ -51,6 +53,9 @@ def clips(tmp_path_factory):
     for name in ("random-41", "random-1-one-clock-3x48", "random-1-apart-3x48", "spheres-3x48"):
         (folder / name).symlink_to(clip)
     (folder / "random-1-lens-0.1").symlink_to(clip)
+    square = [[18, 12], [30, 12], [30, 24], [18, 24]]
+    outlines = {f"cam{view:02d}": square for view in range(5)}
+    write_json(folder / "outlines.json", {"silhouettes": outlines})
     stream_capture(load_capture(clip), folder / "fit", quick())
     write_json(folder / "fit/eval.json", evaluate_stream(folder / "fit").as_dict())
     return folder

@@ -15,7 +15,7 @@ from morgs_mi.cli.main import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
-from morgs_mi.evaluate.comparison import _nearest_views
+from morgs_mi.evaluate.comparison import nearest_views
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.measures import REGIONS
@@ -182,7 +182,7 @@ def test_evaluate_stream__copies_the_nearest_training_view_in_place_of_a_held_ou
 def test_nearest_views__have_the_least_angle_from_the_scene():
     cameras = look_at_cameras(arc(np.deg2rad((0, 40, 50, 90)), 4), 40)
     rig = SimpleNamespace(points=np.zeros((1, 3)), train_views=(0, 1, 3), test_views=(2,))
-    assert _nearest_views(rig, cameras) == {2: 1}
+    assert nearest_views(rig, cameras) == {2: 1}
 
 
 def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted_clip, tmp_path):
