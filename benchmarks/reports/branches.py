@@ -340,7 +340,7 @@ BRANCHES: tuple[Branch, ...] = (
         "points between neighbours",
         {
             "fit.initialise:resample_points": lambda points, count, rng: (
-                _RESAMPLE(points, count, rng) if len(points[0]) > count else points
+                _RESAMPLE(points, count, rng) if points.count > count else points
             )
         },
         True,

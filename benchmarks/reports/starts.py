@@ -24,7 +24,7 @@ from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions
 from morgs_mi import Camera, StreamConfig, fit_gaussians, rasterize
 from morgs_mi.core.color_space import byte_values, encode_light
-from morgs_mi.core.rig import focus_depths
+from morgs_mi.core.rig import Focus
 from morgs_mi.core.view import View
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.initialise import seed_points
@@ -237,10 +237,12 @@ def former_points(
     """Return random points in every view, and their colours."""
     points = []
     colors = []
-    for camera, depth, image in zip(cameras, focus_depths(cameras), images, strict=True):
+    focus = Focus.of(cameras)
+    for camera, image in zip(cameras, images, strict=True):
         pixels = rng.uniform(0, camera.size, (_POINTS // len(cameras), 2))
         columns, rows = pixels.astype(int).T
-        points.append(camera.unproject(pixels, depth / rng.uniform(1 / 3, 3, len(pixels))))
+        depths = focus.depth(camera) / rng.uniform(1 / 3, 3, len(pixels))
+        points.append(camera.unproject(pixels, depths))
         colors.append(image[rows, columns] / 255)
     return np.concatenate(points), np.concatenate(colors)
 

@@ -303,6 +303,12 @@ class Camera:
         """
         return replace(self, delay=0.0, readout=0.0)
 
+    def relative_to(self, origin: np.ndarray) -> Camera:
+        """Return the camera relative to a point `origin` [3] of the world."""
+        shift = np.eye(4)
+        shift[:3, 3] = origin
+        return replace(self, viewmat=self.world_to_camera @ shift)
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""
         if (width, height) == self.size:

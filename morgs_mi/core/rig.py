@@ -5,7 +5,8 @@ them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -59,13 +60,6 @@ def far_origin(cameras: Sequence[Camera]) -> np.ndarray:
     return np.round(middle, -int(np.floor(np.log10(10 * size)))) if far else np.zeros(3)
 
 
-def moved(cameras: Sequence[Camera], origin: np.ndarray) -> tuple[Camera, ...]:
-    """Return the cameras relative to a point `origin` [3] of the world."""
-    shift = np.eye(4)
-    shift[:3, 3] = origin
-    return tuple(replace(camera, viewmat=camera.world_to_camera @ shift) for camera in cameras)
-
-
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the mean up direction of the cameras [3], of unit length; the first camera's where
     they cancel out.
@@ -95,14 +89,58 @@ def focus_point(
     return middle + np.linalg.solve(system, right)
 
 
-def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not
-    in front.
-    """
-    focus = np.append(focus_point(cameras), 1)
-    least = 1e-3 * scene_extent(cameras)
-    depths = np.array([camera.world_to_camera[2] @ focus for camera in cameras])
-    return np.where(depths > least, depths, np.inf)
+@dataclass(frozen=True, eq=False)
+class Focus:
+    """The `focus_point` of a rig."""
+
+    point: np.ndarray  #: [3], world units.
+    extent: float  #: `scene_extent` of the cameras.
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera]) -> Focus:
+        """Return the focus of some cameras."""
+        return cls(focus_point(cameras), scene_extent(cameras))
+
+    def depth(self, camera: Camera) -> float:
+        """Return its depth in a view, world units; infinity if it is not in front."""
+        depth = float(camera.world_to_camera[2] @ np.append(self.point, 1))
+        return depth if depth > 1e-3 * self.extent else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePlane:
+    """The plane across a view at the depth of the scene, which stands for the scene there."""
+
+    camera: Camera  #: The view.
+    depth: float  #: World units.
+
+    @classmethod
+    def of(cls, camera: Camera, points: np.ndarray, focus: Focus) -> ScenePlane:
+        """Return the plane at the median depth of the points [P, 3] in a view.
+
+        Without points in the view, it is at the depth of the focus, or at 1e6 scene extents if that
+        is not in front.
+        """
+        far = 1e6 * focus.extent
+        _, _, depths = seen_points(camera, points)
+        depth = float(np.median(depths)) if len(depths) else min(focus.depth(camera), far)
+        return cls(camera, depth if depth > camera.near else far)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Points [P, 3] that are evenly spread over the image."""
+        steps = (np.arange(_GRID) + 0.5) / _GRID
+        grid = np.meshgrid(steps * self.camera.width, steps * self.camera.height)
+        pixels = np.stack(grid, axis=-1).reshape(-1, 2)
+        return self.camera.unproject(pixels, np.full(len(pixels), self.depth))
+
+    def angles_to(self, others: Sequence[Camera]) -> np.ndarray:
+        """Return the angles from its camera to other cameras, as seen from the point in the middle
+        of the image, degrees.
+        """
+        center = np.array([[self.camera.width / 2, self.camera.height / 2]])
+        middle = self.camera.unproject(center, np.array([self.depth]))
+        return np.array([angles_between(middle, self.camera, other)[0] for other in others])
 
 
 def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,16 +179,17 @@ def with_near_planes(
     """
     if near is not None:
         return tuple(replace(camera, near=near) for camera in cameras)
-    depths = _rig_depths(cameras)
-    for i, camera in enumerate(cameras):
-        _, _, z = seen_points(replace(camera, near=_IN_FRONT), points)
-        if len(z) >= _RELIABLE_POINTS:
-            depths[i] = np.quantile(z, _RELIABLE_QUANTILE)
-    depths *= _NEAR_SHARE
-    return tuple(
-        replace(camera, near=float(depth)) if depth > 0 else camera
-        for camera, depth in zip(cameras, depths, strict=True)
-    )
+    positions = positions_of(cameras)
+    focus = Focus.of(cameras)
+    result = []
+    for camera in cameras:
+        _, _, depths = seen_points(replace(camera, near=_IN_FRONT), points)
+        if len(depths) >= _RELIABLE_POINTS:
+            depth = float(np.quantile(depths, _RELIABLE_QUANTILE))
+        else:
+            depth = _rig_depth(camera, focus, positions)
+        result.append(replace(camera, near=_NEAR_SHARE * depth) if depth > 0 else camera)
+    return tuple(result)
 
 
 def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray) -> None:
@@ -159,29 +198,32 @@ def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray)
     Raises:
         ValueError: they are, in a sentence that begins with `where`.
     """
-    depths = scene_depths([replace(camera, near=_IN_FRONT) for camera in cameras], points)
+    focus = Focus.of(cameras)
+
+    def depth_of(camera: Camera) -> float:
+        return ScenePlane.of(replace(camera, near=_IN_FRONT), points, focus).depth
+
     require(
-        any(camera.near <= depth for camera, depth in zip(cameras, depths, strict=True)),
+        any(camera.near <= depth_of(camera) for camera in cameras),
         where,
         "the near planes of `cameras` must be in front of the scene",
-        f"{cameras[0].near:g} world units where it is {depths[0]:.3g} away",
+        f"{cameras[0].near:g} world units where it is {depth_of(cameras[0]):.3g} away",
         "pass with_near_planes(cameras, points), or cameras with a smaller `near`",
     )
 
 
-def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
-    0 if unknown.
+def _rig_depth(camera: Camera, focus: Focus, positions: np.ndarray) -> float:
+    """Return a depth within which a camera shares nothing with the others, by the focus and the
+    positions [V, 3] of the rig alone; 0 if unknown.
     """
-    positions = positions_of(cameras)
-    focus = focus_depths(cameras)
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    nearest = distances.min(axis=1)
-    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
+    depth = min(focus.depth(camera), focus.extent)
+    if np.isinf(focus.depth(camera)):
+        # The least distance is the camera's own.
+        distances = np.sort(np.linalg.norm(positions - camera.position, axis=1))[1:]
+        depth = float(distances.min(initial=np.inf))
     # Cameras at one place are apart by rounding errors.
     rounding = 1e-9 * np.abs(positions).max()
-    return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
+    return depth if np.isfinite(depth) and depth > rounding else 0.0
 
 
 def choose_key_views(
@@ -229,35 +271,21 @@ def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
         cameras: C views.
         points: [P, 3] of the scene, world units, or none.
     """
-    surfaces = [
-        surface_of(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)
-    ]
+    planes = scene_planes(cameras, points)
     return np.array(
-        [[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces]
+        [[np.mean(seen_points(other, plane.points)[0]) for other in cameras] for plane in planes]
     )
 
 
-def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
-    """Return the median depth of the points in each view, world units.
+def scene_planes(cameras: Sequence[Camera], points: np.ndarray) -> list[ScenePlane]:
+    """Return the plane that stands for the scene in each view.
 
-    Without points in a view, it is the depth of the `focus_point`, or 1e6 scene extents if that is
-    not in front.
+    Args:
+        cameras: the rig.
+        points: [P, 3] of the scene, world units, or none.
     """
-    far = 1e6 * scene_extent(cameras)
-    depths = []
-    for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
-        _, _, point_depths = seen_points(camera, points)
-        middle = float(np.median(point_depths)) if len(point_depths) else min(float(focus), far)
-        depths.append(middle if middle > camera.near else far)
-    return depths
-
-
-def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndarray:
-    """Return the angles to other cameras, as seen from the point at a depth in the middle of the
-    image, degrees.
-    """
-    middle = camera.unproject(np.array([[camera.width / 2, camera.height / 2]]), np.array([depth]))
-    return np.array([angles_between(middle, camera, other)[0] for other in others])
+    focus = Focus.of(cameras)
+    return [ScenePlane.of(camera, points, focus) for camera in cameras]
 
 
 def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
@@ -265,12 +293,3 @@ def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
     rays = [camera.position - points for camera in (a, b)]
     x, y = map(unit_vectors, rays)
     return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
-
-
-def surface_of(camera: Camera, depth: float) -> np.ndarray:
-    """Return points that are evenly spread over the image, at one depth."""
-    steps = (np.arange(_GRID) + 0.5) / _GRID
-    pixels = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(
-        -1, 2
-    )
-    return camera.unproject(pixels, np.full(len(pixels), depth))

@@ -15,7 +15,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, exposed
-from morgs_mi.core.rig import angles_to, scene_depths
+from morgs_mi.core.rig import scene_planes
 from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.metrics import recorded_change
 from morgs_mi.playback.player import has_confidence, render
@@ -95,11 +95,9 @@ def nearest_views(recording: Capture, cameras: Sequence[Camera]) -> dict[int, in
     """Return, of each held-out view, the training view at the least angle from it, as seen from the
     scene.
     """
-    depths = scene_depths(cameras, recording.points)
+    planes = scene_planes(cameras, recording.points)
     train_cameras = [cameras[view] for view in recording.train_views]
-    angles = {
-        view: angles_to(cameras[view], depths[view], train_cameras) for view in recording.test_views
-    }
+    angles = {view: planes[view].angles_to(train_cameras) for view in recording.test_views}
     return {view: recording.train_views[values.argmin()] for view, values in angles.items()}
 
 

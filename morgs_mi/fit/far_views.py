@@ -17,25 +17,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera, unit_vectors
 from morgs_mi.core.color_space import unit_values
-from morgs_mi.core.rig import (
-    focus_depths,
-    focus_point,
-    positions_of,
-    up_direction,
-)
+from morgs_mi.core.rig import Focus, focus_point, positions_of, up_direction
 from morgs_mi.core.view import View
 from morgs_mi.fit.forecast import are_far_apart
-from morgs_mi.fit.view import random_pixels, seen_pixels
+from morgs_mi.fit.view import random_pixels, shares_of, shown_colors
 from morgs_mi.platform.checks import valid_pixels
 
-Points = tuple[np.ndarray, np.ndarray]
-"""Points [P, 3] in world units, and their encoded colours [P, 3], of which 1 is white."""
 # Width to which compared views are reduced, px.
 _WIDTH = 128
 # Standard deviation of the blur of their images, px: poses of wide rigs are off by a pixel.
@@ -69,6 +63,30 @@ _CHANCE = 1e-3
 _ABOVE = 0.012
 # Largest share of the points that objects have.
 _OBJECT_SHARE = 0.15
+
+
+class PointCloud(NamedTuple):
+    """Points with colours."""
+
+    positions: np.ndarray  #: [P, 3], world units.
+    colors: np.ndarray  #: [P, 3], encoded: 1 is white.
+
+    @property
+    def count(self) -> int:
+        """P."""
+        return len(self.positions)
+
+    def select(self, rows: np.ndarray | slice) -> PointCloud:
+        """Return some of the points, by indices or by a mask [P]."""
+        return PointCloud(self.positions[rows], self.colors[rows])
+
+    @staticmethod
+    def joined(parts: Sequence[PointCloud]) -> PointCloud:
+        """Return several point clouds, one after the other, as one."""
+        return PointCloud(
+            np.concatenate([part.positions for part in parts]),
+            np.concatenate([part.colors for part in parts]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +126,7 @@ class _Rig:
         """Return the colours [V, P, 3] in which the views show points [P, 3], NaN where they do
         not.
         """
-        result = np.full((len(self.views), len(points), 3), np.nan, np.float32)
-        for view, colors in zip(self.views, result, strict=True):
-            visible, pixels = seen_pixels(view.camera, points)
-            colors[visible] = view.image[pixels]
-        return result
+        return np.stack([shown_colors(view, points) for view in self.views])
 
     def is_near(self, points: np.ndarray, radius: float) -> np.ndarray:
         """Return which points [P, 3] are nearer to the focus than a radius, in distances of the
@@ -133,11 +147,12 @@ def _blurred(view: View) -> View:
 
 def are_around(cameras: Sequence[Camera]) -> bool:
     """Return whether cameras are few, far apart, and look at one place."""
-    is_one_place = bool(np.isfinite(focus_depths(cameras)).all())
+    focus = Focus.of(cameras)
+    is_one_place = all(np.isfinite(focus.depth(camera)) for camera in cameras)
     return is_one_place and are_far_apart(cameras, np.zeros((0, 3)))
 
 
-def far_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
+def far_points(views: Sequence[View], count: int, rng: np.random.Generator) -> PointCloud:
     """Return points [count, 3] of objects, the floor and the backdrop, and their colours
     [count, 3].
 
@@ -149,22 +164,15 @@ def far_points(views: Sequence[View], count: int, rng: np.random.Generator) -> P
     views = [view for view in views if valid_pixels(view.mask, view.image.shape).any()]
     rig = _Rig.of(views)
     floor = _floor(rig, rng)
-    parts = [_objects(rig, floor, round(_OBJECT_SHARE * count), rng)]
-    shares = np.array_split(np.arange(count - len(parts[0][0])), len(views))
-    for view, share in zip(views, shares, strict=True):
-        valid = valid_pixels(view.mask, view.image.shape)
-        pixels, colors = random_pixels(view, valid, len(share), rng)
+    objects = _objects(rig, floor, round(_OBJECT_SHARE * count), rng)
+    parts = []
+    for view, share in shares_of(count - objects.count, views):
+        pixels, colors = random_pixels(view, share, rng)
         points = floor.hits(view.camera, pixels)
         is_behind = ~rig.is_near(points, _FLOOR)
         points[is_behind] = _on_backdrop(rig, view.camera, pixels[is_behind])
-        parts.append((points, colors))
-    return concatenated_points(parts)
-
-
-def concatenated_points(parts: Sequence[Points]) -> Points:
-    """Return several sets of points as one: positions [P, 3] and colours [P, 3]."""
-    positions, colors = zip(*parts, strict=True)
-    return np.concatenate(positions), np.concatenate(colors)
+        parts.append(PointCloud(points, colors))
+    return PointCloud.joined([objects, *parts])
 
 
 def _floor(rig: _Rig, rng: np.random.Generator) -> _Plane:
@@ -213,7 +221,7 @@ def _alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.maximum(1 - np.abs(a - b).max(axis=-1) / _OTHER, 0)
 
 
-def _objects(rig: _Rig, floor: _Plane, count: int, rng: np.random.Generator) -> Points:
+def _objects(rig: _Rig, floor: _Plane, count: int, rng: np.random.Generator) -> PointCloud:
     """Return at most `count` points on whose colour all views agree, above the floor, and their
     colours.
     """
@@ -245,7 +253,7 @@ def _objects(rig: _Rig, floor: _Plane, count: int, rng: np.random.Generator) -> 
         alike = np.abs(colors[:, None] - some).max(axis=2) < _SAME
         chance *= alike.sum(axis=1) / max(len(some), 1)
     is_object = chance < _CHANCE
-    return points[is_object][:count], colors[is_object][:count].astype(np.float64)
+    return PointCloud(points[is_object][:count], colors[is_object][:count].astype(np.float64))
 
 
 def _on_backdrop(rig: _Rig, camera: Camera, pixels: np.ndarray) -> np.ndarray:

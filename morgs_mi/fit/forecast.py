@@ -11,13 +11,7 @@ from math import ceil
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.rig import (
-    angles_between,
-    angles_to,
-    scene_depths,
-    seen_points,
-    surface_of,
-)
+from morgs_mi.core.rig import angles_between, scene_planes, seen_points
 
 MANY_VIEWS = 6
 """Number of cameras from which they are not few."""
@@ -84,14 +78,11 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
             them.
     """
     measures = []
-    for view, (camera, depth) in enumerate(
-        zip(cameras, scene_depths(cameras, points), strict=True)
-    ):
+    for view, plane in enumerate(scene_planes(cameras, points)):
         others = [*cameras[:view], *cameras[view + 1 :]]
-        angles = angles_to(camera, depth, others)
-        surface = surface_of(camera, depth)
-        visible = np.array([seen_points(other, surface)[0] for other in others])
-        to_each = np.array([angles_between(surface, camera, other) for other in others])
+        angles = plane.angles_to(others)
+        visible = np.array([seen_points(other, plane.points)[0] for other in others])
+        to_each = np.array([angles_between(plane.points, plane.camera, other) for other in others])
         nearest = np.where(visible, to_each, _UNSEEN).min(axis=0)
         measures.append((angles.min(), visible[angles.argmin()].mean(), nearest.mean()))
     spacing, overlap, reach = np.mean(measures, axis=0)

@@ -7,7 +7,7 @@ starts from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,14 +17,23 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import focus_depths, in_image, scene_depths, scene_extent, seen_points
+from morgs_mi.core.rig import Focus, in_image, scene_extent, scene_planes, seen_points
 from morgs_mi.core.view import View
-from morgs_mi.fit.far_views import Points, are_around, concatenated_points, far_points
+from morgs_mi.fit.far_views import PointCloud, are_around, far_points
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import SAME_POINT, random_pixels, seen_pixels
+from morgs_mi.fit.view import (
+    SAME_POINT,
+    random_pixels,
+    seen_pixels,
+    shares_of,
+    shown_colors,
+)
 from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.render.render_config import RenderConfig
 
+RGB = tuple[float, float, float]
+"""A colour, encoded: 1 is white."""
+NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3)))
 MIN_POINTS = 20
 """Number of points below which Gaussians start from random ones."""
 MANY_POINTS = 1000
@@ -95,12 +104,12 @@ def from_points(
 
 def initial_points(
     views: Sequence[View],
-    points: Points,
+    points: PointCloud,
     count: int,
     rng: np.random.Generator,
-    background: Sequence[float] | None = None,
-) -> Points:
-    """Return the points that Gaussians start from, at most [count, 3], and their colours.
+    background: RGB | None = None,
+) -> PointCloud:
+    """Return the points that Gaussians start from, at most `count`.
 
     Fewer than `MIN_POINTS` given ones are replaced by random points inside the views, or by
     `far_points` where few cameras stand far apart around a room; where there are few, random ones
@@ -109,19 +118,18 @@ def initial_points(
 
     Args:
         views: V views, at least one.
-        points: P points and their colours.
+        points: P points.
         count: number of points; those in the empty space are not replaced.
         rng: draws points.
         background: encoded colour [3] behind all Gaussians; None: no pixel shows it.
     """
     points = _in_light(points, views)
-    num_points = len(points[0])
     cameras = [view.camera for view in views]
-    if num_points < MANY_POINTS and are_around(cameras) and _fills(views, background):
-        points = concatenated_points([points, far_points(views, max(count - num_points, 1), rng)])
-    elif num_points < MIN_POINTS:
+    if points.count < MANY_POINTS and are_around(cameras) and _fills(views, background):
+        points = PointCloud.joined([points, far_points(views, max(count - points.count, 1), rng)])
+    elif points.count < MIN_POINTS:
         points = seed_points(views, count, rng, background)
-    elif num_points < MANY_POINTS:
+    elif points.count < MANY_POINTS:
         points = fill_points(points, views, count, rng)
     points = resample_points(_outside_empty_space(points, cameras), count, rng)
     # Again, because points between two others may lie there.
@@ -171,60 +179,52 @@ def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     return mask
 
 
-def _outside_empty_space(points: Points, cameras: Sequence[Camera]) -> Points:
+def _outside_empty_space(points: PointCloud, cameras: Sequence[Camera]) -> PointCloud:
     """Return the points that are not `in_empty_space`, or all if all are."""
-    positions, colors = points
-    is_empty = in_empty_space(cameras, positions)
-    return points if is_empty.all() else (positions[~is_empty], colors[~is_empty])
+    is_empty = in_empty_space(cameras, points.positions)
+    return points if is_empty.all() else points.select(~is_empty)
 
 
-def _in_light(points: Points, views: Sequence[View]) -> Points:
+def _in_light(points: PointCloud, views: Sequence[View]) -> PointCloud:
     """Return the points with their median colours in HDR views; their own where no such view shows
     them.
     """
-    positions, own_colors = points
     hdr_views = [view for view in views if np.isinf(view.white)]
-    if not hdr_views or not len(positions):
+    if not hdr_views or not points.count:
         return points
-    colors = np.full((len(hdr_views), *positions.shape), np.nan)
-    for view, view_colors in zip(hdr_views, colors, strict=True):
-        visible, pixels = seen_pixels(view.camera, positions)
-        is_valid = valid_pixels(view.mask, view.image.shape)[pixels]
-        view_colors[visible] = np.where(is_valid[:, None], view.image[pixels], np.nan)
+    colors = np.stack([shown_colors(view, points.positions) for view in hdr_views], dtype=float)
     unseen = np.isnan(colors).all(axis=(0, 2))
-    colors[:, unseen] = own_colors[unseen]
-    return positions, np.nanmedian(colors, axis=0)
+    colors[:, unseen] = points.colors[unseen]
+    return points._replace(colors=np.nanmedian(colors, axis=0))
 
 
-def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:
-    """Return `count` points [count, 3] and colours: a random subset, or with points added between
-    near neighbours.
-    """
-    positions, colors = points
-    if len(positions) >= count:
-        rows = np.sort(rng.choice(len(positions), count, replace=False))
-        return positions[rows], colors[rows]
-    if len(positions) < 2:
+def resample_points(points: PointCloud, count: int, rng: np.random.Generator) -> PointCloud:
+    """Return `count` points: a random subset, or with points added between near neighbours."""
+    if points.count >= count:
+        return points.select(np.sort(rng.choice(points.count, count, replace=False)))
+    if points.count < 2:
         return points
-    num_new = count - len(positions)
-    parent = rng.integers(0, len(positions), num_new)
-    neighbours = np.asarray(KDTree(positions).query(positions[parent], k=min(4, len(positions)))[1])
+    num_new = count - points.count
+    parents = points.select(rng.integers(0, points.count, num_new))
+    tree = KDTree(points.positions)
+    neighbours = np.asarray(tree.query(parents.positions, k=min(4, points.count))[1])
     partner = neighbours[np.arange(num_new), rng.integers(1, neighbours.shape[1], num_new)]
+    partners = points.select(partner)
     blend = rng.uniform(0.2, 0.8, (num_new, 1))
-    new_positions, new_colors = (
-        np.concatenate([values, (1 - blend) * values[parent] + blend * values[partner]])
-        for values in points
+    between = PointCloud(
+        (1 - blend) * parents.positions + blend * partners.positions,
+        (1 - blend) * parents.colors + blend * partners.colors,
     )
-    return new_positions, new_colors
+    return PointCloud.joined([points, between])
 
 
 def seed_points(
     views: Sequence[View],
     count: int,
     rng: np.random.Generator,
-    background: Sequence[float] | None = None,
-) -> Points:
-    """Return random points [count, 3] inside the views, and their colours [count, 3].
+    background: RGB | None = None,
+) -> PointCloud:
+    """Return random points inside the views.
 
     Each view with valid pixels gets the same number of points, in the colours of random pixels that
     do not show the background. Of 64 random depths, a point gets the one at which most views show
@@ -239,26 +239,26 @@ def seed_points(
         rng: draws pixels and depths.
         background: encoded colour [3] behind all Gaussians; None: no pixel shows it.
     """
-    cameras = [view.camera for view in views]
-    distances = focus_depths(cameras)
-    distances[np.isinf(distances)] = _PARALLEL * scene_extent(cameras)
+    focus = Focus.of([view.camera for view in views])
     blurred = [view.at(np.asarray(cv2.blur(view.image, (3, 3)))) for view in views]
-    masks = [_shows_scene(view, background) for view in views]
     sources = [
-        (view, distance, mask)
-        for view, distance, mask in zip(views, distances, masks, strict=True)
-        if mask.any()
+        replace(view, mask=_shows_scene(view, background))
+        for view in views
+        if valid_pixels(view.mask, view.image.shape).any()
     ]
-    parts = [(np.zeros((0, 3)), np.zeros((0, 3)))]
-    shares = np.array_split(np.arange(count), max(len(sources), 1))
-    for (view, distance, mask), share in zip(sources, shares, strict=False):
-        within, colors = random_pixels(view, mask, len(share), rng)
-        depths = max(distance, 10 * view.camera.near) / rng.uniform(1 / 3, 3, (_DEPTHS, len(share)))
+    parts = []
+    for view, share in shares_of(count, sources):
+        within, colors = random_pixels(view, share, rng)
+        distance = focus.depth(view.camera)
+        if np.isinf(distance):
+            distance = _PARALLEL * focus.extent
+        depths = max(distance, 10 * view.camera.near) / rng.uniform(1 / 3, 3, (_DEPTHS, share))
         points = view.camera.unproject(np.tile(within, (_DEPTHS, 1)), depths.ravel())
         counts = _agreeing_views(points, np.tile(colors, (_DEPTHS, 1)), blurred)
         best = counts.reshape(depths.shape).argmax(axis=0)
-        parts.append((points.reshape(*depths.shape, 3)[best, np.arange(len(share))], colors))
-    return concatenated_points(parts)
+        chosen = points.reshape(*depths.shape, 3)[best, np.arange(share)]
+        parts.append(PointCloud(chosen, colors))
+    return PointCloud.joined([NO_POINTS, *parts])
 
 
 def _agreeing_views(points: np.ndarray, colors: np.ndarray, views: Sequence[View]) -> np.ndarray:
@@ -271,7 +271,7 @@ def _agreeing_views(points: np.ndarray, colors: np.ndarray, views: Sequence[View
     return counts
 
 
-def _shows_scene(view: View, background: Sequence[float] | None) -> np.ndarray:
+def _shows_scene(view: View, background: RGB | None) -> np.ndarray:
     """Return the valid pixels [H, W] that do not show the background; all valid ones where none
     is left.
     """
@@ -282,19 +282,19 @@ def _shows_scene(view: View, background: Sequence[float] | None) -> np.ndarray:
     return shows_scene if shows_scene.any() else is_valid
 
 
-def _fills(views: Sequence[View], background: Sequence[float] | None) -> bool:
+def _fills(views: Sequence[View], background: RGB | None) -> bool:
     """Return whether few pixels of the views show the background."""
     num_shown = sum(_shows_scene(view, background).sum() for view in views)
     num_valid = sum(valid_pixels(view.mask, view.image.shape).sum() for view in views)
     return num_shown > (1 - _BORDER) * num_valid
 
 
-def _is_alike(colors: np.ndarray, background: Sequence[float] | np.ndarray) -> np.ndarray:
+def _is_alike(colors: np.ndarray, background: RGB | np.ndarray) -> np.ndarray:
     """Return which of the colours [..., 3] are the background's [...]."""
     return np.abs(colors - np.asarray(background)).max(axis=-1) <= _SAME_BACKGROUND
 
 
-def border_color(views: Sequence[View]) -> tuple[float, float, float] | None:
+def border_color(views: Sequence[View]) -> RGB | None:
     """Return the encoded colour of the border pixels of the views, None where they have no colour
     in common.
     """
@@ -314,7 +314,7 @@ def border_color(views: Sequence[View]) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
-def mean_color(views: Sequence[View]) -> tuple[float, float, float]:
+def mean_color(views: Sequence[View]) -> RGB:
     """Return the mean encoded colour of the valid pixels of the views."""
     means = []
     for view in views:
@@ -325,28 +325,27 @@ def mean_color(views: Sequence[View]) -> tuple[float, float, float]:
 
 
 def fill_points(
-    points: Points, views: Sequence[View], count: int, rng: np.random.Generator
-) -> Points:
-    """Return points [count, 3] and their colours: the given ones, resampled, and random ones where
-    views show none.
+    points: PointCloud, views: Sequence[View], count: int, rng: np.random.Generator
+) -> PointCloud:
+    """Return `count` points: the given ones, resampled, and random ones where views show none.
 
     A view is divided into cells. Those that show no point get random pixels, at the mean depth of
     the nearest points in the image, which is far better than a random depth (see
     `docs/experiments/first-frame.md`).
 
     Args:
-        points: P points and their colours.
+        points: P points.
         views: V views.
         count: number of points.
         rng: draws pixels and depths.
     """
     parts = []
-    for view, share in zip(views, np.array_split(np.arange(count), len(views)), strict=True):
-        _, point_pixels, depths = seen_points(view.camera, points[0])
+    for view, share in shares_of(count, views):
+        _, point_pixels, depths = seen_points(view.camera, points.positions)
         if not len(point_pixels):
             continue
         size = view.camera.size
-        pixels = rng.uniform(0, size, (len(share), 2))
+        pixels = rng.uniform(0, size, (share, 2))
         point_cells = (point_pixels * _CELLS / size).astype(int)
         cells = (pixels * _CELLS / size).astype(int)
         is_free = np.ones((_CELLS, _CELLS), bool)
@@ -365,9 +364,9 @@ def fill_points(
         depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
         depth = depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
         colors = unit_values(view.image[rows[chosen], columns[chosen]])
-        parts.append((view.camera.unproject(pixels, depth), colors))
-    num_new = sum(len(positions) for positions, _ in parts)
-    return concatenated_points([resample_points(points, count - num_new, rng), *parts])
+        parts.append(PointCloud(view.camera.unproject(pixels, depth), colors))
+    num_new = sum(part.count for part in parts)
+    return PointCloud.joined([resample_points(points, count - num_new, rng), *parts])
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +384,7 @@ class FirstFrameProblem:
     def of(
         cls,
         views: Sequence[View],
-        points: Points,
+        points: PointCloud,
         config: FitConfig,
         render: RenderConfig,
         rng: np.random.Generator,
@@ -395,7 +394,7 @@ class FirstFrameProblem:
 
         Args:
             views: V views, at least one.
-            points: P points and their colours; P may be 0.
+            points: P points; P may be 0.
             config: number and SH degree of the Gaussians.
             render: cut-offs.
             rng: draws points.
@@ -403,10 +402,9 @@ class FirstFrameProblem:
         start_points = initial_points(views, points, config.first_count, rng, render.background)
         start = from_points(*start_points, config.sh_degree, _OPACITY)
         cameras = [view.camera for view in views]
-        extent = max(
-            scene_extent(cameras), _DEPTH * float(np.median(scene_depths(cameras, start_points[0])))
-        )
-        return cls(start, tuple(views), points[0], extent, render)
+        depths = [plane.depth for plane in scene_planes(cameras, start_points.positions)]
+        extent = max(scene_extent(cameras), _DEPTH * float(np.median(depths)))
+        return cls(start, tuple(views), points.positions, extent, render)
 
     @property
     def cameras(self) -> list[Camera]:

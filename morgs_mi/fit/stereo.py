@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.rig import angles_to, scene_depths, seen_points
+from morgs_mi.core.rig import ScenePlane, scene_planes, seen_points
 from morgs_mi.core.view import View
 from morgs_mi.fit.features import reduced_size
 from morgs_mi.fit.view import SAME_POINT, seen_pixels
@@ -62,16 +62,16 @@ def stereo_points(
     cameras = [view.camera for view in views]
     reduced = [_Reduced.of(view) for view in views]
     batches = [np.zeros((0, 6), np.float32)]
-    depths = scene_depths(cameras, scene_points)
+    planes = scene_planes(cameras, scene_points)
     pairs = set()  # of cameras that are close enough
-    for i, camera in enumerate(cameras):
-        angles = angles_to(camera, depths[i], cameras)
+    for i, plane in enumerate(planes):
+        angles = plane.angles_to(cameras)
         angles[i] = np.inf
         for j in np.argsort(angles)[:_NEIGHBOURS].tolist():
             if _MIN_ANGLE <= angles[j] <= _MAX_ANGLE:
                 pairs.add((min(i, j), max(i, j)))
     for i, j in sorted(pairs):
-        points = _matched(reduced[i], reduced[j], _depth_range(cameras[i], depths[i], scene_points))
+        points = _matched(reduced[i], reduced[j], _depth_range(planes[i], scene_points))
         others = [view for k, view in enumerate(reduced) if k not in (i, j)]
         points = _some_confirmed(rng.permutation(points), others)
         batches.append(points.astype(np.float32))
@@ -98,13 +98,13 @@ class _Reduced:
         return cls(view.camera.resized(*size), image, cv2.blur(image, (3, 3)), valid)
 
 
-def _depth_range(camera: Camera, middle: float, scene_points: np.ndarray) -> tuple[float, float]:
-    """Return the smallest and the largest depth in a view, around `middle` if few are known."""
-    _, _, depths = seen_points(camera, scene_points)
+def _depth_range(plane: ScenePlane, scene_points: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest depth in a view, around its plane if few are known."""
+    _, _, depths = seen_points(plane.camera, scene_points)
     if len(depths) >= _KNOWN:
         near, far = np.quantile(depths, (0.02, 0.98))
         return _NEAR * float(near), _FAR * float(far)
-    return middle / _BLIND, middle * _BLIND
+    return plane.depth / _BLIND, plane.depth * _BLIND
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,9 @@ class _Rectified:
     axes: np.ndarray  # axes of the plane, rows right, down and forward in the world [3, 3]
     focal: float  # focal length, px
     baseline: float  # distance of the cameras, world units
-    # mappings from the pixels of each view to the pixels of its rectified image, for OpenCV, whose
-    # pixel centres lie at whole numbers
-    homographies: list[np.ndarray]
-    # position of each image's first column relative to the optical axis, px, and of their first row
-    corners: tuple[float, float, float]
+    left: _RectifiedView  # the first view
+    right: _RectifiedView  # the second view
+    top: float  # position of their first rows relative to the optical axes, px
     size: tuple[int, int]  # width and height of both images
 
     @classmethod
@@ -134,27 +132,52 @@ class _Rectified:
         forward /= max(float(np.linalg.norm(forward)), 1e-12)
         axes = np.stack([right, np.cross(forward, right), forward])
         focal = float(a.K[0, 0] + b.K[0, 0]) / 2
-        to_plane = []  # homographies from the pixels
-        corners = []  # of the images, in homogeneous pixels [4, 3]
-        for camera in (a, b):
-            H = np.diag([focal, focal, 1]) @ axes
-            H = H @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
-            places = [[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]
-            to_plane.append(H)
-            corners.append(np.array(places) @ H.T)
-        if any(rays[:, 2].min() < _LEAST_DEPTH for rays in corners):
+        plane = np.diag([focal, focal, 1]) @ axes
+        to_plane_a = plane @ a.viewmat[:3, :3].T @ np.linalg.inv(a.K)
+        to_plane_b = plane @ b.viewmat[:3, :3].T @ np.linalg.inv(b.K)
+        corners_a = _corners(a) @ to_plane_a.T
+        corners_b = _corners(b) @ to_plane_b.T
+        if min(corners_a[:, 2].min(), corners_b[:, 2].min()) < _LEAST_DEPTH:
             return None
+        ax, ay = (corners_a[:, :2] / corners_a[:, 2:]).T
+        bx, by = (corners_b[:, :2] / corners_b[:, 2:]).T
         # The images have the rows that both views have.
-        (ax, ay), (bx, by) = ((rays[:, :2] / rays[:, 2:]).T for rays in corners)
         top = max(ay.min(), by.min())
         width = max(np.ptp(ax), np.ptp(bx))
         size = int(np.ceil(width)), int(np.ceil(min(ay.max(), by.max()) - top))
-        starts = (ax.min(), bx.min(), top)
-        homographies = [
-            _shift(-0.5, -0.5) @ (_shift(-start, -top) @ H) @ _shift(0.5, 0.5)
-            for start, H in zip(starts, to_plane, strict=False)
-        ]
-        return cls(axes, focal, baseline, homographies, starts, size)
+        left = _RectifiedView.of(to_plane_a, ax.min(), top)
+        right = _RectifiedView.of(to_plane_b, bx.min(), top)
+        return cls(axes, focal, baseline, left, right, top, size)
+
+
+@dataclass(frozen=True)
+class _RectifiedView:
+    """Mapping of a view to its rectified image."""
+
+    # from its pixels to those of the rectified image, for OpenCV, whose pixel centres lie at whole
+    # numbers [3, 3]
+    homography: np.ndarray
+    start: float  # position of the image's first column relative to the optical axis, px
+
+    @classmethod
+    def of(cls, to_plane: np.ndarray, start: float, top: float) -> _RectifiedView:
+        """Return the mapping to an image that begins at a place of the plane, px."""
+        homography = _shift(-0.5, -0.5) @ (_shift(-start, -top) @ to_plane) @ _shift(0.5, 0.5)
+        return cls(homography, start)
+
+    def image(self, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return the rectified image of a view's image, of some width and height."""
+        return cv2.warpPerspective(image, self.homography, size)
+
+    def mask(self, mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return the rectified mask of a view's mask, uint8, of some width and height."""
+        return cv2.warpPerspective(mask, self.homography, size, flags=cv2.INTER_NEAREST) > 0
+
+
+def _corners(camera: Camera) -> np.ndarray:
+    """Return the corners of the image of a camera, in homogeneous pixels [4, 3]."""
+    w, h = camera.size
+    return np.array([[0, 0, 1], [0, h, 1], [w, 0, 1], [w, h, 1]])
 
 
 def _matched(a: _Reduced, b: _Reduced, depths: tuple[float, float]) -> np.ndarray:
@@ -165,7 +188,7 @@ def _matched(a: _Reduced, b: _Reduced, depths: tuple[float, float]) -> np.ndarra
         return none
     # The lowest disparity, and the number of disparities, of these depths.
     product = rig.focal * rig.baseline
-    shift = rig.corners[1] - rig.corners[0]  # disparity of infinitely distant points, px
+    shift = rig.right.start - rig.left.start  # disparity of infinitely distant points, px
     lowest = int(np.floor(product / depths[1] + shift))
     steps = product / depths[0] + shift - lowest + 1
     count = 16 * max(1, int(np.ceil(steps / 16)))
@@ -173,25 +196,24 @@ def _matched(a: _Reduced, b: _Reduced, depths: tuple[float, float]) -> np.ndarra
     width, height = rig.size
     if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.valid.size:
         return none
-    left, right = map(cv2.warpPerspective, (a.image, b.image), rig.homographies, [rig.size] * 2)
+    left = rig.left.image(a.image, rig.size)
+    right = rig.right.image(b.image, rig.size)
     forth = _disparity(left, right, lowest, count)
     back = _disparity(right, left, 1 - lowest - count, count)
-    valid = [
-        cv2.warpPerspective(view.valid, H, rig.size, flags=cv2.INTER_NEAREST) > 0
-        for view, H in zip((a, b), rig.homographies, strict=True)
-    ]
+    left_valid = rig.left.mask(a.valid, rig.size)
+    right_valid = rig.right.mask(b.valid, rig.size)
     # The pixels with a partner in the other image, which is valid and has them as its partner.
-    rows, columns = np.nonzero(valid[0] & (forth >= lowest) & (forth - shift > 0))
+    rows, columns = np.nonzero(left_valid & (forth >= lowest) & (forth - shift > 0))
     disparity = forth[rows, columns]
     partner = np.round(columns - disparity).astype(int)
     place = np.clip(partner, 0, width - 1)
     agree = np.abs(disparity + back[rows, place]) <= _MAX_DIFFERENCE
-    good = agree & (partner == place) & valid[1][rows, place]
+    good = agree & (partner == place) & right_valid[rows, place]
     rows = rows[good]
     columns = columns[good]
     depth = product / (disparity[good] - shift)
-    x = (columns + 0.5 + rig.corners[0]) * depth / rig.focal
-    y = (rows + 0.5 + rig.corners[2]) * depth / rig.focal
+    x = (columns + 0.5 + rig.left.start) * depth / rig.focal
+    y = (rows + 0.5 + rig.top) * depth / rig.focal
     points = np.stack([x, y, depth], axis=1) @ rig.axes + a.camera.position
     return np.concatenate([points, left[rows, columns] / 255.0], axis=1)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -65,13 +65,22 @@ def withheld_blocks(
     return visible, withheld
 
 
+def shares_of(count: int, views: Sequence[View]) -> Iterator[tuple[View, int]]:
+    """Yield each of the views with its share of a number of points; the first ones may have one
+    more.
+    """
+    share, rest = divmod(count, max(len(views), 1))
+    for k, view in enumerate(views):
+        yield view, share + (k < rest)
+
+
 def random_pixels(
-    view: View, mask: np.ndarray, count: int, rng: np.random.Generator
+    view: View, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return random positions [count, 2] in the pixels of a mask [H, W], and their colours
+    """Return random positions [count, 2] in the valid pixels of a view, and their colours
     [count, 3], encoded.
     """
-    rows, columns = np.nonzero(mask)
+    rows, columns = np.nonzero(valid_pixels(view.mask, view.image.shape))
     chosen = rng.integers(0, len(rows), count)
     rows = rows[chosen]
     columns = columns[chosen]
@@ -86,6 +95,17 @@ def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, tuple[A
     visible, pixels, _ = seen_points(camera, points)
     columns, rows = pixels.astype(int).T
     return visible, (rows, columns)
+
+
+def shown_colors(view: View, points: np.ndarray) -> np.ndarray:
+    """Return the colours [P, 3] in which the valid pixels of a view with an image of floats show
+    points [P, 3], NaN where they do not.
+    """
+    visible, pixels = seen_pixels(view.camera, points)
+    is_valid = valid_pixels(view.mask, view.image.shape)[pixels]
+    colors = np.full((len(points), 3), np.nan, view.image.dtype)
+    colors[visible] = np.where(is_valid[:, None], view.image[pixels], np.nan)
+    return colors
 
 
 def rendered(

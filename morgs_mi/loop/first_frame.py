@@ -19,14 +19,15 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.view import View, Views
 from morgs_mi.fit.balance import balance_cameras, short_fit_config
 from morgs_mi.fit.budget import plan_first_frame
+from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.image_points import image_points
 from morgs_mi.fit.initialise import (
     MANY_POINTS,
     MIN_POINTS,
+    NO_POINTS,
     FirstFrameProblem,
-    Points,
     has_points,
     unseen_points,
 )
@@ -180,7 +181,7 @@ def fitted_first_frame(
     views = [view.in_scene(exposures) for view in observed.views.values()]
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan, seconds = plan_first_frame(views, setup.points, config.fit)
-    cloud = setup.points, setup.point_colors
+    cloud = PointCloud(setup.points, setup.point_colors)
     problem = FirstFrameProblem.of(views, cloud, plan, config.render, rng)
     fit_config = adapted_to_images(plan, problem)
 
@@ -233,15 +234,14 @@ def fitted_first_frame(
     return packet, report
 
 
-def _found_points(setup: Setup, observed: FrameObservation, progress: Progress) -> Points:
+def _found_points(setup: Setup, observed: FrameObservation, progress: Progress) -> PointCloud:
     """Return the points that are found in the images, none if these are too few to cover the
     views.
     """
     progress.of("Matching views")(0, 1)
     rng = rng_of(setup.config.seed, Stream.POINTS)
-    points, colors = image_points([*observed.views.values()], rng)
-    count = len(points) if len(points) >= MANY_POINTS else 0
-    return points[:count], colors[:count]
+    points = PointCloud(*image_points([*observed.views.values()], rng))
+    return points if points.count >= MANY_POINTS else NO_POINTS
 
 
 def preview(
@@ -285,7 +285,7 @@ def _balanced(
     if len(observed.views) > 1:
         rng = rng_of(config.seed, Stream.BALANCED_POINTS)
         fit = short_fit_config(config.fit)
-        cloud = setup.points, setup.point_colors
+        cloud = PointCloud(setup.points, setup.point_colors)
         views = [view.in_scene() for view in observed.views.values()]
         problem = FirstFrameProblem.of(views, cloud, fit, config.render, rng)
         balance = balance_cameras(problem, config.fit, config.seed, progress, on_round)

@@ -5,16 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.fit.far_views import are_around, far_points
+from morgs_mi.fit.far_views import PointCloud, are_around, far_points
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.initialise import FirstFrameProblem, initial_points, mean_color, seed_points
+from morgs_mi.fit.initialise import (
+    NO_POINTS,
+    FirstFrameProblem,
+    initial_points,
+    mean_color,
+    seed_points,
+)
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.room import CENTRE, FLOOR, RADIUS, rig, room_view
-
-NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3))
 
 
 def outwards(cameras):
@@ -79,12 +83,12 @@ def test_initial_points__of_few_far_cameras_are_far_points():
     assert {*map(tuple, points)} <= {*map(tuple, seeds)}, (
         "the ball alone, before a plain background"
     )
-    few = np.zeros((100, 3)), np.zeros((100, 3))
+    few = PointCloud(np.zeros((100, 3)), np.zeros((100, 3)))
     points, _ = initial_points(views, few, 500, np.random.default_rng(0))
     assert (np.abs(points) < 1e-9).all(axis=1).sum() == 100, "the given ones, and others"
     assert len(np.unique(points, axis=0)) > 300
     given = np.random.default_rng(0).uniform(-1, 1, (1500, 3))
-    points, _ = initial_points(views, (given, given * 0), 500, np.random.default_rng(0))
+    points, _ = initial_points(views, PointCloud(given, given * 0), 500, np.random.default_rng(0))
     assert {*map(tuple, points)} <= {*map(tuple, given)}
 
 

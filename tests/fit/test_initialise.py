@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
 from morgs_mi.core.view import View
+from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.initialise import (
     MIN_POINTS,
     _in_light,
@@ -28,7 +29,8 @@ def few_points():
     rng = np.random.default_rng(0)
     cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
     points = np.stack([rng.uniform(0.2, 2, 40), rng.uniform(-2, 2, 40), np.full(40, 2.0)], axis=1)
-    return (points, np.full((40, 3), 0.8)), [grey_view(camera) for camera in cameras]
+    cloud = PointCloud(points, np.full((40, 3), 0.8))
+    return cloud, [grey_view(camera) for camera in cameras]
 
 
 def grey_view(camera, mask=None):
@@ -40,7 +42,7 @@ def test_fill_points__adds_points_at_the_depth_of_the_others_where_views_show_no
     points, views = few_points()
     filled, filled_colors = fill_points(points, views, 1000, np.random.default_rng(1))
     assert filled.shape == filled_colors.shape == (1000, 3)
-    assert_array_equal(filled[:40], points[0])
+    assert_array_equal(filled[:40], points.positions)
     added = np.isclose(filled_colors, 0.2).all(axis=1)
     assert 300 < added.sum() < 900
     assert np.mean(filled[added, 0] < 0.2) > 0.7
@@ -59,7 +61,7 @@ def test_fill_points__adds_none_where_pixels_are_not_valid():
 @pytest.mark.parametrize("count", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
 def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(count):
     (points, colors), views = few_points()
-    point_cloud = np.resize(points, (count, 3)), np.resize(colors, (count, 3))
+    point_cloud = PointCloud(np.resize(points, (count, 3)), np.resize(colors, (count, 3)))
     result, result_colors = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
     assert result.shape == result_colors.shape == (1000, 3)
     random = np.isclose(result_colors, 0.2).all(axis=1)
@@ -73,7 +75,7 @@ def test_initial_points__leave_the_space_before_near_planes_empty(count):
     (points, colors), views = few_points()
     views = [replace(view, camera=replace(view.camera, near=5.0)) for view in views]
     points = np.concatenate([points, points - (0, 0, 4)])
-    point_cloud = np.resize(points, (count, 3)), np.resize(colors, (count, 3))
+    point_cloud = PointCloud(np.resize(points, (count, 3)), np.resize(colors, (count, 3)))
     chosen, _ = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
     assert len(chosen) > 950
     assert not in_empty_space([view.camera for view in views], chosen).any()
@@ -199,9 +201,9 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
     views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
     cube = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
     outside = np.array([[90, 0, 0]])
-    points = np.concatenate([cube, outside]), np.full((31, 3), 0.75)
+    points = PointCloud(np.concatenate([cube, outside]), np.full((31, 3), 0.75))
     expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
-    assert_allclose(_in_light(points, views)[1], expected)
+    assert_allclose(_in_light(points, views).colors, expected)
     assert (
         _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras])
         is points

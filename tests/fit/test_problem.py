@@ -10,6 +10,7 @@ from morgs_mi import RenderConfig
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.core.view import View
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.fit.view import mean_psnr, rendered, withheld_blocks
@@ -29,7 +30,8 @@ def large_view(mask=None):
 
 
 def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fit():
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)), np.full((300, 3), 0.25)
+    positions = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3))
+    points = PointCloud(positions, np.full((300, 3), 0.25))
     config = FitConfig(sh_degree=2, num_gaussians=100, density=DensityConfig(rounds=1))
     views_of_ball = [
         View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)
@@ -39,7 +41,7 @@ def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fi
     )
     assert (len(result.start), result.start.sh_degree) == (50, 2)  # half, as it grows to all
     assert_allclose(result.start.opacities, 0.3, rtol=1e-6)
-    assert result.points is points[0]
+    assert result.points is positions
     assert result.extent == scene_extent(views())
     assert [camera.name for camera in result.cameras] == [camera.name for camera in views()]
 
@@ -121,7 +123,7 @@ def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
             View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras
         ]
         config = FitConfig(num_gaussians=50)
-        cloud = points, np.full_like(points, 0.5)
+        cloud = PointCloud(points, np.full_like(points, 0.5))
         return FirstFrameProblem.of(
             black_views, cloud, config, RenderConfig(), np.random.default_rng(0)
         ).extent

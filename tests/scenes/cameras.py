@@ -66,3 +66,8 @@ def make_sensor_camera():
     K = camera.K.copy()
     K[1, 1] = K[0, 0]
     return replace(camera, K=K)
+
+
+def moved(cameras, origin):
+    """Return cameras relative to a point of the world."""
+    return [camera.relative_to(origin) for camera in cameras]

@@ -25,7 +25,7 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.rig import far_origin, moved, scene_extent
+from morgs_mi.core.rig import far_origin, scene_extent
 from morgs_mi.io.clip_readers import Clip
 from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
 from morgs_mi.io.numbering import frame_numbers, natural_key
@@ -103,10 +103,11 @@ class Calibration:
         """
         cameras = [view.camera for view in self.views]
         origin = far_origin(cameras)
-        local = zip(self.views, moved(cameras, origin), strict=True)
         result = replace(
             self,
-            views=tuple(replace(view, camera=camera) for view, camera in local),
+            views=tuple(
+                replace(view, camera=view.camera.relative_to(origin)) for view in self.views
+            ),
             points=(self.points - origin).astype(np.float32),
             origin=tuple(origin.tolist()),
         )
@@ -328,7 +329,8 @@ def _check_fixed(
 ) -> None:
     """Check that two images of a clip have the same pose, relative to `origin` [3], and lens."""
     # Tolerances of poses are relative to their coordinates.
-    a, b = moved((first.camera, other.camera), origin)
+    a = first.camera.relative_to(origin)
+    b = other.camera.relative_to(origin)
     if not (
         np.allclose(a.viewmat, b.viewmat, atol=1e-6)
         and np.allclose(a.K, b.K)

@@ -33,6 +33,7 @@ from morgs_mi.extras.calibration.bundle import (
     prior_deviations,
 )
 from morgs_mi.fit.balance import short_fit_config
+from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.features import detect, intersect, join_matches, match_views
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
@@ -189,7 +190,9 @@ class RefinementProblem:
         """Return the PSNR of the withheld pixels, dB, after a fit with changed cameras."""
         problem = FirstFrameProblem.of(
             _changed(self.views, changes),
-            (_moved(self.capture.points, self.cameras, changes), self.capture.point_colors),
+            PointCloud(
+                _moved(self.capture.points, self.cameras, changes), self.capture.point_colors
+            ),
             self._short,
             self.render,
             rng_of(self.seed, Stream.REFINED_POINTS),

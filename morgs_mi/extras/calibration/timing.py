@@ -32,6 +32,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
+from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
@@ -257,7 +258,7 @@ class _Clips:
         )
         fit_views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
         rng = rng_of(0, Stream.TIMING)
-        points = (self.capture.points, self.capture.point_colors)
+        points = PointCloud(self.capture.points, self.capture.point_colors)
         problem = FirstFrameProblem.of(fit_views, points, fit, RenderConfig(), rng)
         gaussians = fit_first_frame(problem, fit, rng).gaussians
         views = [ActiveView(camera) for camera in self.cameras]

@@ -12,7 +12,6 @@ import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import moved
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
@@ -214,7 +213,7 @@ def named_path(
         return orbit(cameras, focus(cameras, means), degrees, clip)
     origin = stream_origin(stream)
     path = load_path(name, cameras[0])
-    return replace(path, keys=moved(path.keys, origin))
+    return replace(path, keys=tuple(key.relative_to(origin) for key in path.keys))
 
 
 def repeated_frames(stream: FrameSource, freeze: int | None = None) -> Iterator[Gaussians]:

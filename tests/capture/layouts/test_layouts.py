@@ -18,12 +18,12 @@ from morgs_mi.capture.layouts.calibration import CalibratedView, Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import MODELS
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.testing import assert_close
 from tests.capture.layouts.test_colmap import as_binary
 from tests.scenes import captures as layouts
+from tests.scenes.cameras import moved
 from tests.scenes.captures import (
     COUNT,
     FPS,
@@ -422,9 +422,7 @@ FAR = np.array([500000.0, 5300000.0, 120.0])
 def test_load_capture__of_a_far_rig_is_relative_to_an_origin(tmp_path, caplog, monkeypatch, build):
     near = load_capture(build(tmp_path / "near"))
     assert near.origin == (0, 0, 0)
-    monkeypatch.setattr(
-        layouts, "rig", lambda *args, **shift: list(moved(rig(*args, **shift), -FAR))
-    )
+    monkeypatch.setattr(layouts, "rig", lambda *args, **shift: moved(rig(*args, **shift), -FAR))
     far = load_capture(build(tmp_path / "far"))
     shift = np.array(far.origin) - FAR
     assert (np.abs(shift) < 10).all()

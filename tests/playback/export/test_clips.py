@@ -12,7 +12,6 @@ from numpy.testing import assert_array_equal
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light
-from morgs_mi.core.rig import moved
 from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.io.ply import read_ply
 from morgs_mi.playback.export.clips import (
@@ -23,6 +22,7 @@ from morgs_mi.playback.export.frames import exr_channels, pad_to_even
 from morgs_mi.playback.export.web import write_web_folder
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.testing import assert_close
+from tests.scenes.cameras import moved
 from tests.scenes.changing_splats import rig, write_stream
 
 
