@@ -47,8 +47,8 @@ from morgs_mi.render.backend import elements, on_aligned_stack
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.region import DrawnBlocks, Region
 
-_Rows = list[list[Float]]  # a row of pixels of each plane
-_Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
+_Row = Jit  # `packet_type` of the numbers of a row of pixels
+_Read = Callable[[Float], _Row]  # plane -> its numbers around the lane's row
 
 _C1 = 0.01**2
 _C2 = 0.03**2
@@ -293,13 +293,13 @@ def _statistics_pass(
 ) -> tuple[list[Float], Float]:
     """Return the planes of M y and M yy - (M y)^2, and the sum of M y over each run."""
 
-    def moments(read: _Read) -> _Rows:
+    def moments(read: _Read) -> list[_Row]:
         y = read(target)
-        return [y, [v * v for v in y]]
+        return [y, y * y]
 
-    def statistics(read: _Read, means: _Rows) -> tuple[_Rows, list[Jit]]:
+    def statistics(read: _Read, means: list[_Row], counts: Bool) -> tuple[list[_Row], Jit]:
         mean, square = means
-        return [mean, [dr.fma(-m, m, s) for m, s in zip(mean, square, strict=True)]], mean
+        return [mean, dr.fma(-mean, mean, square)], dr.select(counts, mean, 0)
 
     return _walk(size, lanes, height, moments, statistics, 2, 2, mi.Float(0))
 
@@ -317,25 +317,23 @@ def _similarity_pass(
     run.
     """
 
-    def products(read: _Read) -> _Rows:
+    def products(read: _Read) -> list[_Row]:
         x = read(image)
         y = read(target)
-        return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
+        return [x, x * x, x * y]
 
-    def similarity(read: _Read, means: _Rows) -> tuple[_Rows, list[Jit]]:
-        terms = [
-            _similarity(*values) for values in zip(*means, read(mean), read(variance), strict=True)
-        ]
-        ssim, *derivatives = map(list, zip(*terms, strict=True))
-        return derivatives, ssim
+    def similarity(read: _Read, means: list[_Row], counts: Bool) -> tuple[list[_Row], Jit]:
+        mx, xx, xy = means
+        ssim, *derivatives = _similarity(mx, xx, xy, read(mean), read(variance))
+        return derivatives, dr.select(counts, ssim, 0)
 
     return _walk(size, lanes, height, products, similarity, 3, 3, mi.Float(0))
 
 
 def _similarity(
-    mx: Float, xx: Float, xy: Float, my: Float, variance: Float
-) -> tuple[Float, Float, Float, Float]:
-    """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
+    mx: _Row, xx: _Row, xy: _Row, my: _Row, variance: _Row
+) -> tuple[_Row, _Row, _Row, _Row]:
+    """Return SSIM of the windows of a row and its derivatives by M x, M xx and M xy."""
     a1 = dr.fma(2 * mx, my, _C1)
     a2 = dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
     b1 = dr.fma(mx, mx, dr.fma(my, my, _C1))
@@ -360,19 +358,19 @@ def _gradient_pass(
 ) -> tuple[list[Float], Jit]:
     """Return the planes of dL/dx, and the sums of |x - y| and (x - y)^2 over each run."""
 
-    def unchanged(read: _Read) -> _Rows:
+    def unchanged(read: _Read) -> list[_Row]:
         return [read(plane) for plane in derivatives]
 
-    def gradient(read: _Read, means: _Rows) -> tuple[_Rows, list[Jit]]:
-        row = []
-        errors = []
-        for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *means, strict=True):
-            error = x - y
-            structure = dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
-            sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
-            row.append(scale * ((1 - weight) * sign - weight * structure))
-            errors.append(mi.Vector2f(dr.abs(error), dr.square(error)))
-        return [row], errors
+    def gradient(read: _Read, means: list[_Row], counts: Bool) -> tuple[list[_Row], Jit]:
+        d_x, d_xx, d_xy = means
+        x = read(image)
+        y = read(target)
+        error = x - y
+        structure = dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+        sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
+        row = scale * ((1 - weight) * sign - weight * structure)
+        error = dr.select(counts, error, 0)
+        return [row], [mi.Vector2f(dr.abs(e), dr.square(e)) for e in error]
 
     return _walk(size, lanes, height, unchanged, gradient, 3, 1, mi.Vector2f(0))
 
@@ -381,8 +379,8 @@ def _walk(
     size: int,
     lanes: Lanes,
     height: Int32,
-    across: Callable[[_Read], _Rows],
-    finish: Callable[[_Read, _Rows], tuple[_Rows, list[Jit]]],
+    across: Callable[[_Read], list[_Row]],
+    finish: Callable[[_Read, list[_Row], Bool], tuple[list[_Row], Jit]],
     inputs: int,
     outputs: int,
     total: Jit,
@@ -395,8 +393,8 @@ def _walk(
         lanes: the runs.
         height: height of the image.
         across: read -> rows of numbers, wider than a strip by 5 on both sides.
-        finish: (read, these rows blurred, of a strip) -> (rows of a strip to write, row of a strip
-            to sum).
+        finish: (read, these rows blurred, of a strip, mask of its pixels that count) -> (rows of a
+            strip to write, numbers of a strip to sum, 0 for other pixels).
         inputs: number of rows to blur.
         outputs: number of rows to write.
         total: 0, of the type of the numbers to sum.
@@ -411,16 +409,16 @@ def _walk(
         valid = (row >= 0) & (row < height)
         down = mi.UInt32(row) * COLUMN
 
-        def wide(plane: Float) -> list[Float]:
+        def wide(plane: Float) -> _Row:
             numbers = [v for place in lanes.places for v in read_packet(plane, place + down, valid)]
-            return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
+            return packet(numbers[STRIP - RADIUS : 2 * STRIP + RADIUS])
 
         sums = []
-        for values in across(wide):
-            shifted = [packet(values[k : k + STRIP]) for k in range(2 * RADIUS + 1)]
-            total = shifted[0] * _TAPS[0]
-            for tap, v in zip(_TAPS[1:], shifted[1:], strict=True):
-                total = dr.fma(v, tap, total)
+        for row_of_plane in across(wide):
+            values = list(row_of_plane)
+            total = packet(values[:STRIP]) * _TAPS[0]
+            for k, tap in enumerate(_TAPS[1:], 1):
+                total = dr.fma(packet(values[k : k + STRIP]), tap, total)
             sums += list(total)
         return packet(sums)
 
@@ -434,28 +432,22 @@ def _walk(
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
         windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
 
-        masks = [lanes.columns > k for k in range(STRIP)]
+        valid = dr.mask_t(packet)([lanes.columns > k for k in range(STRIP)])
         for k in range(2):
             at = row + k - RADIUS
             center = lanes.places[1] + mi.UInt32(at) * COLUMN
             ready = (at >= lanes.first) & (at < end)
 
-            def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> list[Float]:
-                return list(read_packet(plane, center, ready))
+            def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> _Row:
+                return read_packet(plane, center, ready)
 
             sums = list(done[k])
-            planes, numbers = finish(
-                narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)]
-            )
+            means = [packet(sums[STRIP * c : STRIP * (c + 1)]) for c in range(inputs)]
+            planes, numbers = finish(narrow, means, valid & ready)
             for target, values in zip(targets, planes, strict=True):
-                write_packet(
-                    target,
-                    [dr.select(t, v, 0) for t, v in zip(masks, values, strict=True)],
-                    center,
-                    ready,
-                )
-            for t, v in zip(masks, numbers, strict=True):
-                total = total + dr.select(t & ready, v, 0)
+                write_packet(target, dr.select(valid, values, 0), center, ready)
+            for number in numbers:
+                total = total + number
         return row + 2, windows, total, targets
 
     windows = [packet([mi.Float(0) for _ in range(inputs * STRIP)]) for _ in range(2 * RADIUS)]

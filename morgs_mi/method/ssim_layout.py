@@ -9,7 +9,7 @@ an image: derivatives of windows there are 0, and are read.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.arrays import from_numpy, opaque
-from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, UInt32
+from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, Matrix3f, UInt32
 from morgs_mi.render.backend import elements
 from morgs_mi.render.region import DrawnBlocks, Region, quotient_and_rest
 
@@ -30,8 +30,9 @@ RADIUS = 5
 STRIP = 8  # pixels wide: a window extends at most into the next strip
 COLUMN = 16  # strips
 _SPARE = 2  # strips on either side
-# Weights of the rows of Sobel's filter, whose differences are of two pixels.
-_SOBEL = (0.125, 0.25, 0.125)
+# Weight of an outer row of Sobel's filter, whose differences are of two pixels; the middle row has
+# twice as much.
+_SOBEL = 0.125
 # Rows of a run: enough that the 10 rows before it cost little, few enough to occupy every thread.
 _LONGEST = 64
 
@@ -155,9 +156,10 @@ class Planes:
         component, x, y = self._pixels_of(region)
         xs = _neighbours(x, self.width)
         ys = _neighbours(y, self.height)
-        rows = [[elements(planes, self._place(component, b, a)) for a in xs] for b in ys]
-        along_x = _slope(rows)
-        along_y = _slope([*zip(*rows, strict=True)])
+        near = [[elements(planes, self._place(component, b, a)) for a in xs] for b in ys]
+        neighbours = mi.Matrix3f(near)
+        along_x = _slope(neighbours)
+        along_y = _slope(neighbours.T)
         dr.eval(along_x, along_y)
         return along_x, along_y
 
@@ -229,13 +231,15 @@ class Planes:
         # In all three planes, one after the other.
         planes = np.arange(3)[:, None] * (self.size // (3 * STRIP))
         near = strip + np.arange(-1, 2)[:, None]
-        numbers = np.empty((len(RUN), 3, len(strip)), np.int32)
-        numbers[:3] = (self._place(0, 0, near * STRIP) // STRIP)[:, None] + planes
-        numbers[3:] = np.stack([first, end, columns])[:, None]
-        kinds = (np.uint32, np.uint32, np.uint32, np.int32, np.int32, np.uint32)
+        places = (self._place(0, 0, near * STRIP) // STRIP)[:, None] + planes
+        left, middle, right = places.astype(np.uint32).reshape(3, -1)
         runs = {
-            name: values.ravel().view(kind)
-            for name, values, kind in zip(RUN, numbers, kinds, strict=True)
+            "left": left,
+            "middle": middle,
+            "right": right,
+            "first": np.tile(first.astype(np.int32), 3),
+            "end": np.tile(end.astype(np.int32), 3),
+            "columns": np.tile(columns.astype(np.uint32), 3),
         }
         return runs, count
 
@@ -262,9 +266,11 @@ def _neighbours(place: UInt32, size: int) -> list[UInt32]:
     ]
 
 
-def _slope(rows: Sequence[Sequence[Float]]) -> Float:
-    """Return the mean slope along three rows of three numbers, per px."""
-    return sum(weight * (row[2] - row[0]) for weight, row in zip(_SOBEL, rows, strict=True))
+def _slope(neighbours: Matrix3f) -> Float:
+    """Return the mean slope along the rows of a pixel and its neighbours, per px."""
+    outer = neighbours[0, 2] - neighbours[0, 0]
+    middle = neighbours[1, 2] - neighbours[1, 0]
+    return _SOBEL * (outer + 2 * middle + (neighbours[2, 2] - neighbours[2, 0]))
 
 
 def _within(cells: np.ndarray, reach: int) -> np.ndarray:
@@ -278,7 +284,7 @@ def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit
 
 
 def write_packet(
-    target: Float, values: list[Float], place: UInt32, active: Bool | bool = True
+    target: Float, values: Jit | list[Float], place: UInt32, active: Bool | bool = True
 ) -> None:
     """Write 8 floats to 8 `place`, which differs between lanes."""
     dr.scatter(target, packet_type()(values), place, active=active, mode=dr.ReduceMode.NoConflicts)
