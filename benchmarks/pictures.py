@@ -32,11 +32,12 @@ from morgs_mi.extras.synth.synthesize import synthesize
 from morgs_mi.io.video import VideoReader
 from morgs_mi.loop.input_images import FrameImages
 from morgs_mi.loop.observation import FrameObservation, observe_frame
-from morgs_mi.method.active_set import full_active_set
+from morgs_mi.method.flow import ViewFlow
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.playback.player import explained_image
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import label, side_by_side, to_uint8
+from morgs_mi.render.active_view import ActiveView
 from morgs_mi.stream_loop import StreamLoop
 
 _CAPTURE = Path("out/demo/capture")
@@ -152,10 +153,12 @@ def _lifted(gaussians: Gaussians, loop: StreamLoop, observation: FrameObservatio
     """Return the Gaussians after the displacement that explains the flow of the key views best
     (`lift_flow`).
     """
-    flows = {v: view.flow for v, view in observation.key_views.items()}
-    cameras = {v: loop.setup.cameras[v] for v in flows}
-    views = full_active_set(gaussians, cameras, loop.setup.config.render).views
-    return displaced(gaussians, lift_flow(gaussians, views, flows).displacement)
+    render = loop.setup.config.render
+    flows = [
+        ViewFlow(ActiveView(loop.setup.cameras[v], render), view.flow)
+        for v, view in observation.key_views.items()
+    ]
+    return displaced(gaussians, lift_flow(gaussians, flows).displacement)
 
 
 def _channel(gaussians: Gaussians, camera: Camera, name: str) -> np.ndarray:

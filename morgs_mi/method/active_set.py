@@ -54,7 +54,7 @@ from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.core.view import View
 from morgs_mi.method.boxes import Boxes, boxes_around
-from morgs_mi.render.active_view import ActiveView, ViewGroup
+from morgs_mi.render.active_view import ActiveView, ViewGroup, narrowed
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.region import BlockGrid, Region, stacked
 from morgs_mi.render.render_config import RenderConfig
@@ -111,8 +111,9 @@ class ChangedViews:
     @cached_property
     def counts(self) -> np.ndarray:
         """Number of changed pixels of each block, int32 [V, rows, columns], see `stacked`."""
-        pairs = zip(self.boxes.grids, self.views, strict=True)
-        return stacked([grid.counts(view.change) for grid, view in pairs])
+        return stacked(
+            [BlockGrid.of(view.camera, self.render).counts(view.change) for view in self.views]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +132,14 @@ class _ReducedView:
         size = (max(view.camera.width // factor, 1), max(view.camera.height // factor, 1))
         change = 255 * view.change.astype(np.uint8)
         share = cv2.resize(change, size, interpolation=cv2.INTER_AREA)
-        blocks = BlockGrid(*size, block_shape(render)).counts(share > 0) > 0
-        return cls(view.camera.resized(*size), share / np.float32(255), blocks, factor)
+        camera = view.camera.resized(*size)
+        blocks = BlockGrid.of(camera, render).counts(share > 0) > 0
+        return cls(camera, share / np.float32(255), blocks, factor)
 
     def drawn(self, render: RenderConfig) -> ActiveView:
         """Return the view of the blocks with changes."""
-        grid = BlockGrid(*self.camera.size, block_shape(render))
-        return ActiveView(self.camera, render, Region(grid, self.blocks))
+        region = Region(BlockGrid.of(self.camera, render), self.blocks)
+        return ActiveView(self.camera, render, region)
 
 
 def responsibility(
@@ -296,14 +298,8 @@ def find_active_set(
     # Those that hardly change are drawn in some views only.
     drawn = np.tile(active & (shares > QUIET), (len(views), 1))
     drawn[[*choose_key_views([*cameras.values()], QUIET_VIEWS)]] = active
-    boxes = changed_views.boxes
-    drawn_blocks = boxes.union(drawn) | (changed_views.counts > 0)
-    active_views = {}
-    for v, grid, blocks in zip(cameras, boxes.grids, drawn_blocks, strict=True):
-        if blocks.any():
-            rows, columns = grid.shape
-            region = Region(grid, blocks[:rows, :columns])
-            active_views[v] = ActiveView(cameras[v], render, region)
+    blocks = changed_views.boxes.union(drawn) | (changed_views.counts > 0)
+    active_views = narrowed(full_active_set(gaussians, cameras, render).views, blocks)
     return ActiveSet(np.flatnonzero(active), len(gaussians), active_views, len(cameras))
 
 

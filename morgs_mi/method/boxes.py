@@ -16,7 +16,7 @@ from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Float, UInt32
-from morgs_mi.render.backend import block_shape, elements
+from morgs_mi.render.backend import elements
 from morgs_mi.render.projection import TracedCameras, project
 from morgs_mi.render.region import BlockGrid, quotient, quotient_and_rest
 from morgs_mi.render.render_config import RenderConfig
@@ -145,5 +145,5 @@ def boxes_around(
         first = mi.Point2u(low)
         end = mi.Point2u(dr.select(splats.valid, high, low))
         dr.eval(first, end)
-    grids = [BlockGrid(*camera.size, block_shape(render)) for camera in cameras]
+    grids = [BlockGrid.of(camera, render) for camera in cameras]
     return Boxes(grids, first.x, first.y, end.x, end.y)

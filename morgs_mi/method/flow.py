@@ -20,6 +20,7 @@ from morgs_mi.method.flow_sources.flow_registry import (
 from morgs_mi.method.mask_refiners.mask_registry import MaskConfig
 from morgs_mi.platform.checks import valid_pixels
 from morgs_mi.platform.threads import map_in_threads
+from morgs_mi.render.active_view import ActiveView
 
 # Tolerated squared mismatch of the flows forth and back, as a share of their squared lengths, and
 # of the shortest flows, px^2 (Sundaram, Brox and Keutzer, ECCV 2010).
@@ -39,6 +40,14 @@ class FlowObservation:
     forward_reliable: np.ndarray  #: [H, W] bool, likewise.
     #: Motion mask [H, W] bool (eq. 10), or None if it was not requested.
     mask: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFlow:
+    """An active view with its optical flow."""
+
+    view: ActiveView  #: The view.
+    flow: FlowObservation  #: The flow of its whole image.
 
 
 def observe_key_views(

@@ -27,7 +27,7 @@ the mean over the key views that see the Gaussian: it moves if e_i > 0.5.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,10 +36,10 @@ import numpy as np
 
 from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.flow import ViewFlow
 from morgs_mi.method.flow_sources.flow_registry import NOISE_PX
 from morgs_mi.method.motion_start import MotionStart
-from morgs_mi.render.active_view import ActiveView, ViewGroup
+from morgs_mi.render.active_view import ViewGroup
 
 # Numbers of a pixel that are summed per Gaussian.
 _FLOW_MAPS = 3
@@ -85,27 +85,20 @@ class _Flows:
         return np.log1p(np.sum((self.flow - self.project(d)) ** 2, axis=-1) / scale**2)
 
 
-def lift_flow(
-    gaussians: Gaussians,
-    views: Mapping[int, ActiveView],
-    observations: Mapping[int, FlowObservation],
-) -> MotionStart:
+def lift_flow(gaussians: Gaussians, flows: Sequence[ViewFlow]) -> MotionStart:
     """Return the displacements that explain the flow of the key views best, and the confidence that
     follows from it.
 
     Args:
         gaussians: N Gaussians of frame t - 1.
-        views: active views, by view index.
-        observations: flow of the key views, by view index; those without an active view are not
-            used.
+        flows: the key views with their flow.
     """
-    indices = sorted(observations.keys() & views.keys())
-    if not indices:
+    if not flows:
         N = len(gaussians)
         return MotionStart(np.zeros((N, 3), np.float32), np.full(N, -LOGIT, np.float32))
-    group = ViewGroup([views[v] for v in indices])
-    flow = group.crop([observations[v].forward_flow for v in indices])
-    reliable = group.crop([observations[v].forward_reliable for v in indices])
+    group = ViewGroup([each.view for each in flows])
+    flow = group.crop([each.flow.forward_flow for each in flows])
+    reliable = group.crop([each.flow.forward_reliable for each in flows])
     # u and 1 where the flow u is reliable; 0 elsewhere.
     maps = np.empty((*reliable.shape, _FLOW_MAPS), np.float32)
     maps[..., :2] = flow
@@ -113,15 +106,15 @@ def lift_flow(
     maps *= reliable[..., None]
     sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
     means = np.asarray(gaussians.means, np.float64)
-    flows = _Flows(
+    observed = _Flows(
         sums[..., 2],
         sums[..., :2] / np.maximum(sums[..., 2:], 1e-6),
         np.stack([view.camera.projection_jacobian(means) for view in group.views]),
     )
-    d = _solve(flows, np.ones_like(flows.weight))
+    d = _solve(observed, np.ones_like(observed.weight))
     for _ in range(_ROUNDS):  # iteratively reweighted least squares
-        d = _solve(flows, np.exp(-flows.cost(d, flows.project(d))))
-    moves = _evidence(flows, d) > _MIN_EVIDENCE
+        d = _solve(observed, np.exp(-observed.cost(d, observed.project(d))))
+    moves = _evidence(observed, d) > _MIN_EVIDENCE
     return MotionStart(
         np.where(moves[:, None], d, 0).astype(np.float32),
         np.where(moves, LOGIT, -LOGIT).astype(np.float32),

@@ -171,7 +171,7 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
 
 
 STARTS: dict[str, Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]] = {
-    "lift_flow": lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows),
+    "lift_flow": lambda p, start, config: lift_flow(p.gaussians, p.flows),
     "propagate_motion": lambda p, start, config: propagate_motion(p, start),
     "search_motion": lambda p, start, _: search_motion(p, start),
     "refine_start": lambda p, start, config: refine_start(p, start) if config.two_gates else start,

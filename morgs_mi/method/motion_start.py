@@ -13,9 +13,10 @@ from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.types import Arrays
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.cohesion import NeighbourIndex
-from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.flow import ViewFlow
 from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.sweep import MAPS, KeyImages
+from morgs_mi.render.active_view import narrowed
 
 SOFT_LOGIT = 0.3
 """Logit of the confidence of a Gaussian that moves by a proposal or the search: 0.57, as some
@@ -55,9 +56,9 @@ class MotionProblem:
     _last: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def flows(self) -> dict[int, FlowObservation]:
-        """Optical flow of the views, by view index."""
-        return {v: view.flow for v, view in self.views.items() if view.flow is not None}
+    def flows(self) -> list[ViewFlow]:
+        """The views that have optical flow."""
+        return [ViewFlow(view, view.flow) for view in self.views.values() if view.flow is not None]
 
     @cached_property
     def neighbours(self) -> NeighbourIndex:
@@ -94,10 +95,5 @@ class MotionProblem:
         cameras = [view.camera for view in self.views.values()]
         every = np.ones(len(some), bool)
         reached = [boxes_around(place, cameras, config, 1.0).union(every) for place in places]
-        views = {}
-        for (index, view), blocks in zip(self.views.items(), np.any(reached, axis=0), strict=True):
-            rows, columns = view.grid.shape
-            narrow_view = view.narrowed(blocks[:rows, :columns])
-            if narrow_view is not None:
-                views[index] = narrow_view
+        views = narrowed(self.views, np.any(reached, axis=0))
         return KeyImages(views) if views else None

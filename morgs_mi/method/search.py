@@ -68,24 +68,24 @@ def search_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     displacement = start.displacement
     logit = start.logit_confidence
     gaussians = problem.gaussians
-    parts = _unexplained_parts(problem, displacement, _MAX_PARTS)
-    surfaces = []
-    for first in range(0, len(parts), _COLORS):
-        surfaces += _cost_surfaces(problem, parts[first : first + _COLORS])
-    for part, part_surfaces in zip(parts, surfaces, strict=True):
-        center = np.asarray(gaussians.means)[part].mean(axis=0)
-        d = _best_displacement(center, part_surfaces)
+    masks = _unexplained_parts(problem, displacement, _MAX_PARTS)
+    parts: list[_Part] = []
+    for first in range(0, len(masks), _COLORS):
+        parts += _parts_of(problem, masks[first : first + _COLORS])
+    for part in parts:
+        center = np.asarray(gaussians.means)[part.mask].mean(axis=0)
+        d = _best_displacement(center, part.surfaces)
         if not d.any():
             continue
-        proposal = np.where(part[:, None], d, displacement).astype(np.float32)
-        images = problem.images_around(part, [displacement, proposal])
+        proposal = np.where(part.mask[:, None], d, displacement).astype(np.float32)
+        images = problem.images_around(part.mask, [displacement, proposal])
         if images is None:
             continue
         old_error = images.total_error(displaced(gaussians, displacement))
         new_error = images.total_error(displaced(gaussians, proposal))
         if new_error < _ERROR_RATIO * old_error:
             displacement = proposal
-            logit = np.where(part, np.maximum(logit, SOFT_LOGIT), logit)
+            logit = np.where(part.mask, np.maximum(logit, SOFT_LOGIT), logit)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
@@ -119,34 +119,35 @@ def _unexplained_parts(
     return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
 
-def _cost_surfaces(problem: MotionProblem, parts: Sequence[np.ndarray]) -> list[list[_CostSurface]]:
-    """Return the cost surfaces of each of up to three parts, in the views that show it."""
-    surfaces = [[] for _ in parts]
-    images = problem.images_around(np.any(parts, axis=0), [])
+def _parts_of(problem: MotionProblem, masks: Sequence[np.ndarray]) -> list[_Part]:
+    """Return up to three parts, by their masks, with their cost surfaces."""
+    parts = [_Part(mask, []) for mask in masks]
+    images = problem.images_around(np.any(masks, axis=0), [])
     if images is None:
-        return surfaces
+        return parts
     widest = max(view.camera.width for view in images.views.values())
     factor = _reduction(widest, images.group.region.block)
     # The weight of a part is the increase of a pixel if the part is brighter by 1: in red, green or
     # blue.
     sh_coeffs = np.array(problem.gaussians.sh_coeffs)
     for k, part in enumerate(parts):
-        sh_coeffs[part, 0, k] += 1 / np.float32(SH_C0)
+        sh_coeffs[part.mask, 0, k] += 1 / np.float32(SH_C0)
     colors = images.rendered(problem.gaussians, factor)
     brighter_colors = images.rendered(replace(problem.gaussians, sh_coeffs=sh_coeffs), factor)
-    for view, color, brighter in zip(images.views.values(), colors, brighter_colors, strict=True):
+    for v, view in images.views.items():
+        color = colors[v]
         target = view.target.image()
         height = target.shape[0] // factor
         width = target.shape[1] // factor
         target = target[: height * factor, : width * factor]
         if factor > 1:
             target = cv2.resize(target, (width, height), interpolation=cv2.INTER_AREA)
-        weights = np.clip(brighter - color, 0, 1)
-        for k in range(len(parts)):
+        weights = np.clip(brighter_colors[v] - color, 0, 1)
+        for k, part in enumerate(parts):
             if weights[..., k].any():
                 cost = _matching_cost(target, color, weights[..., k]) * factor**2
-                surfaces[k].append(_CostSurface(cost, view.camera, 1 / factor))
-    return surfaces
+                part.surfaces.append(_CostSurface(cost, view.camera, 1 / factor))
+    return parts
 
 
 def _reduction(width: int, block: tuple[int, int]) -> int:
@@ -200,6 +201,14 @@ def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface]) -> 
     ends = np.stack([d, np.zeros(3)])
     at_d, at_rest = np.sum([surface.at(center, ends) for surface in surfaces], axis=0)
     return d if at_d < _COST_RATIO * at_rest else np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Connected Gaussians that are searched for."""
+
+    mask: np.ndarray  # which of all Gaussians, bool [N]
+    surfaces: list[_CostSurface]  # in the views that show it
 
 
 @dataclass(frozen=True, eq=False)

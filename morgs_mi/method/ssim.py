@@ -31,7 +31,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.arrays import from_numpy, opaque, owned_copy
-from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, Tensor, UInt32
+from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, Tensor, UInt32, Vector2f
 from morgs_mi.method.ssim_layout import (
     COLUMN,
     RADIUS,
@@ -201,6 +201,10 @@ class Target:
         None: 1.
         """
         return _on(self, region)
+
+    def gradient(self, region: Region) -> Vector2f:
+        """Return the derivatives of the target along x and y on a region, flat, per px."""
+        return self.planes.gradient_on(self.pixels, region)
 
     def constant_error(self, region: Region | None = None) -> float:
         """Return the mean squared error of the best image of one grey, over the valid pixels of a

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.arrays import from_numpy, opaque
-from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, Matrix3f, UInt32
+from morgs_mi.core.types import Arrays, Bool, Float, Int32, Jit, Matrix3f, UInt32, Vector2f
 from morgs_mi.render.backend import elements
 from morgs_mi.render.region import DrawnBlocks, Region, quotient_and_rest
 
@@ -149,7 +149,7 @@ class Planes:
         valid = (x < opaque(mi.UInt32, self.width)) & (y < opaque(mi.UInt32, self.height))
         return dr.select(valid, self._place(component, y, x), 0), valid
 
-    def gradient_on(self, planes: Float, region: Region) -> tuple[Float, Float]:
+    def gradient_on(self, planes: Float, region: Region) -> Vector2f:
         """Return the derivatives of an image in `planes` along x and y on a region, flat, per px,
         by Sobel's filter.
         """
@@ -158,10 +158,9 @@ class Planes:
         ys = _neighbours(y, self.height)
         near = [[elements(planes, self._place(component, b, a)) for a in xs] for b in ys]
         neighbours = mi.Matrix3f(near)
-        along_x = _slope(neighbours)
-        along_y = _slope(neighbours.T)
-        dr.eval(along_x, along_y)
-        return along_x, along_y
+        gradient = mi.Vector2f(_slope(neighbours), _slope(neighbours.T))
+        dr.eval(gradient)
+        return gradient
 
     def _pixels_of(self, region: DrawnBlocks) -> tuple[UInt32, UInt32, UInt32]:
         """Return (component, x, y) of the numbers of a flat image on a region."""

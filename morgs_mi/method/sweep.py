@@ -21,19 +21,19 @@ import numpy as np
 
 from morgs_mi.core.arrays import concatenated
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.types import Arrays, Float
+from morgs_mi.core.types import Arrays, Float, Jit, UInt32, Vector2f, Vector3f
 from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.render.active_view import Drawing, ViewGroup
 from morgs_mi.render.backend import elements
 
-_Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
+_Map = Callable[[Vector3f, Vector3f, Vector3f], Jit]
 
 MAPS: dict[str, _Map] = {
     "weight": lambda e, x, y: [mi.Float(1)],
-    "error": lambda e, x, y: [sum(abs(v) for v in e) / 3],
+    "error": lambda e, x, y: [dr.sum(dr.abs(e)) / 3],
     "color": lambda e, x, y: e,
-    "normal": lambda e, x, y: [_dot(x, x), _dot(x, y), _dot(y, y)],
-    "right": lambda e, x, y: [_dot(e, x), _dot(e, y)],
+    "normal": lambda e, x, y: [dr.sum(x * x), dr.sum(x * y), dr.sum(y * y)],
+    "right": lambda e, x, y: [dr.sum(e * x), dr.sum(e * y)],
 }
 """Name of a map -> its numbers at a pixel, from e and the derivatives of the target along x and y,
 three colours each.
@@ -63,8 +63,6 @@ class KeyImages:
     def __init__(self, views: Mapping[int, ObservedView]) -> None:
         self.views = views
         self.group = ViewGroup([*views.values()])
-        targets = [view.target for view in views.values()]
-        self._targets = [*zip(targets, self.group.regions, strict=True)]
 
     def sums(self, gaussians: Gaussians, names: Sequence[str]) -> Arrays:
         """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one
@@ -78,11 +76,11 @@ class KeyImages:
         with dr.suspend_grad():
             error = self._difference(drawing)
             dr.eval(error)
-            gradient = self._gradient if {"normal", "right"} & set(names) else (error, error)
+            x = y = error
+            if {"normal", "right"} & set(names):
+                x, y = self._gradient
             lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
-            pixel = [
-                [elements(values, 3 * lane + c) for c in range(3)] for values in (error, *gradient)
-            ]
+            pixel = [_colors(values, lane) for values in (error, x, y)]
             columns = [MAPS[name](*pixel) for name in names]
             *ends, count = np.cumsum([len(column) for column in columns]).tolist()
             image = dr.empty(mi.Float, dr.width(lane) * count)
@@ -94,9 +92,9 @@ class KeyImages:
             name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, parts, strict=True)
         }
 
-    def rendered(self, gaussians: Gaussians, factor: int = 1) -> list[np.ndarray]:
-        """Return the image of Gaussians in each view [H // factor, W // factor, 3]; 0 where the
-        view is not drawn.
+    def rendered(self, gaussians: Gaussians, factor: int = 1) -> dict[int, np.ndarray]:
+        """Return the image of Gaussians in each view [H // factor, W // factor, 3], by view index;
+        0 where the view is not drawn.
 
         Args:
             gaussians: N Gaussians, detached.
@@ -107,12 +105,13 @@ class KeyImages:
         color = color.reshape(A, height // factor, factor, width // factor, factor, 3).mean(
             axis=(2, 4)
         )
-        regions = self.group.regions
-        parts = np.split(color, np.cumsum([region.num_blocks for region in regions])[:-1])
-        return [
-            region.uncropped(part)[: region.height // factor, : region.width // factor]
-            for region, part in zip(regions, parts, strict=True)
-        ]
+        regions = {v: view.drawn for v, view in self.views.items()}
+        counts = [region.num_blocks for region in regions.values()]
+        parts = np.split(color, np.cumsum(counts)[:-1])
+        return {
+            v: region.uncropped(part)[: region.height // factor, : region.width // factor]
+            for (v, region), part in zip(regions.items(), parts, strict=True)
+        }
 
     def total_error(self, gaussians: Gaussians) -> float:
         """Return the error |e| of Gaussians, summed over all drawn pixels."""
@@ -127,7 +126,7 @@ class KeyImages:
     @cached_property
     def _pixels(self) -> tuple[Float, Float | None]:
         """The targets on the group, and the weights of their numbers; None: 1."""
-        targets = [target.on(region) for target, region in self._targets]
+        targets = [view.target.on(view.drawn) for view in self.views.values()]
         pixels = concatenated([numbers for numbers, _ in targets])
         if all(weight is None for _, weight in targets):
             return pixels, None
@@ -138,14 +137,11 @@ class KeyImages:
         return pixels, concatenated(weights)
 
     @cached_property
-    def _gradient(self) -> tuple[Float, Float]:
+    def _gradient(self) -> Vector2f:
         """The derivatives of the targets along x and y, per px, flat on the group."""
-        gradients = [
-            target.planes.gradient_on(target.pixels, region) for target, region in self._targets
-        ]
-        x, y = zip(*gradients, strict=True)
-        return concatenated(x), concatenated(y)
+        return concatenated([view.target.gradient(view.drawn) for view in self.views.values()])
 
 
-def _dot(a: list[Float], b: list[Float]) -> Float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _colors(values: Float, pixel: UInt32) -> Vector3f:
+    """Return the colours of pixels of a flat image."""
+    return mi.Vector3f(*(elements(values, 3 * pixel + c) for c in range(3)))

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,6 @@ from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.platform.checks import check_type, require
-from morgs_mi.render.backend import block_shape
 from morgs_mi.render.background import backdrops, over
 from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
 from morgs_mi.render.compositing import Layout, blend, record_gradients
@@ -109,16 +108,35 @@ class ActiveView:
     @property
     def grid(self) -> BlockGrid:
         """All blocks of the view."""
-        return BlockGrid(self.camera.width, self.camera.height, block_shape(self.config))
+        return BlockGrid.of(self.camera, self.config)
 
-    def narrowed(self, blocks: np.ndarray) -> ActiveView | None:
-        """Return the view restricted to some of its drawn blocks, bool [rows, columns]; None if
-        there are none.
-        """
-        blocks = blocks if self.region is None else blocks & self.region.drawn
-        if not blocks.any():
-            return None
-        return replace(self, region=Region(self.grid, blocks), lists=None)
+    @cached_property
+    def drawn(self) -> Region:
+        """The blocks that are drawn, as a region also if they are the whole view."""
+        if self.region is not None:
+            return self.region
+        return Region.of(np.ones((self.camera.height, self.camera.width), bool), self.config)
+
+
+AnyActiveView = TypeVar("AnyActiveView", bound=ActiveView)
+
+
+def narrowed(views: Mapping[int, AnyActiveView], blocks: np.ndarray) -> dict[int, AnyActiveView]:
+    """Return views restricted to some of their drawn blocks, without those that have none left.
+
+    Args:
+        views: V views, by view index.
+        blocks: bool [V, rows, columns], of which a smaller view has the first ones (see `stacked`).
+    """
+    result = {}
+    for (v, view), requested in zip(views.items(), blocks, strict=True):
+        rows, columns = view.grid.shape
+        requested = requested[:rows, :columns]
+        if view.region is not None:
+            requested = requested & view.region.drawn
+        if requested.any():
+            result[v] = replace(view, region=Region(view.grid, requested), lists=None)
+    return result
 
 
 class ViewGroup:
@@ -132,25 +150,19 @@ class ViewGroup:
 
     Attributes:
         views: the views.
-        regions: their regions.
         region: the blocks of all of them, see `joined`.
         config: cut-offs and block shape.
     """
 
     def __init__(self, views: Sequence[ActiveView]) -> None:
         self.views = tuple(views)
-        self.regions = tuple(
-            view.region
-            or Region.of(np.ones((view.camera.height, view.camera.width), bool), view.config)
-            for view in views
-        )
-        self.region = joined(self.regions)
+        self.region = joined([view.drawn for view in views])
         self.config = self.views[0].config
 
     def crop(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return an image of the group from one image [H, W, ...] per view."""
         return np.concatenate(
-            [region.crop(image) for region, image in zip(self.regions, images, strict=True)]
+            [view.drawn.crop(image) for view, image in zip(self.views, images, strict=True)]
         )
 
     @cached_property
@@ -248,7 +260,7 @@ class ViewGroup:
                 numbers = np.concatenate([N + np.arange(count) for count in counts])
                 number = concatenated([number, from_numpy(mi.UInt32, numbers)])
             lists = build_lists(splats, [], self.region, self.config, margin=margin)
-            counts = [region.num_blocks for region in self.regions]
+            counts = [view.drawn.num_blocks for view in self.views]
             view_of = from_numpy(mi.UInt32, np.arange(len(counts)).repeat(counts))
             shared = SharedLists.of(lists, number, view_of, len(counts))
         firsts = np.cumsum([0, *counts[:-1]]).tolist()

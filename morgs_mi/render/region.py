@@ -18,6 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
 from morgs_mi.core.arrays import from_numpy, opaque
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.types import Float, Jit, Point2u, UInt32
 from morgs_mi.render.backend import block_shape, elements, sections
 from morgs_mi.render.render_config import RenderConfig
@@ -36,6 +37,11 @@ class BlockGrid:
     width: int  #: Width of the view in pixels.
     height: int  #: Height of the view in pixels.
     block: tuple[int, int]  #: (width, height) of a block in pixels.
+
+    @classmethod
+    def of(cls, camera: Camera, config: RenderConfig) -> BlockGrid:
+        """Return the blocks of a camera's view."""
+        return cls(camera.width, camera.height, block_shape(config))
 
     @property
     def size(self) -> tuple[int, int]:

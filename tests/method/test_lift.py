@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.rig import choose_key_views
-from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.flow import FlowObservation, ViewFlow
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import arc, look_at_cameras
@@ -38,8 +38,9 @@ def uniform_flow(camera, shift):
 
 
 def lifted_from(gaussians, flows):
+    cameras = rig()
     return lift_flow(
-        gaussians, {view: ActiveView(camera) for view, camera in enumerate(rig())}, flows
+        gaussians, [ViewFlow(ActiveView(cameras[v]), flow) for v, flow in flows.items()]
     )
 
 

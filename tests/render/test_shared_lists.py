@@ -9,7 +9,13 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi import RenderConfig
-from morgs_mi.render.active_view import ActiveView, ViewGroup, lists_of_views, view_groups
+from morgs_mi.render.active_view import (
+    ActiveView,
+    ViewGroup,
+    lists_of_views,
+    narrowed,
+    view_groups,
+)
 from morgs_mi.render.rasterize import render_view
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
@@ -94,4 +100,4 @@ def test_lists__are_dropped_where_a_view_is_narrowed():
     view = ActiveView(camera, RenderConfig(), lists=lists)
     blocks = np.zeros(view.grid.shape, bool)
     blocks[0, 0] = True
-    assert view.narrowed(blocks).lists is None
+    assert narrowed({0: view}, blocks[None])[0].lists is None

@@ -60,7 +60,7 @@ def views_of(gaussians):
 
 def split(group, image):
     """Return the image of each view on its region from an image of a group."""
-    return np.split(image, np.cumsum([region.num_blocks for region in group.regions])[:-1])
+    return np.split(image, np.cumsum([view.drawn.num_blocks for view in group.views])[:-1])
 
 
 @pytest.mark.slow
@@ -71,14 +71,11 @@ def test_view_group__draws_what_each_view_draws(gaussians):
     drawing = group.draw(active)
     images = split(group, np.asarray(drawing.color).reshape(group.region.shape(3)))
     weights = [
-        np.random.default_rng(k).normal(size=region.shape(2))
-        for k, region in enumerate(group.regions)
+        np.random.default_rng(k).normal(size=view.drawn.shape(2)) for k, view in enumerate(views)
     ]
     sums = drawing.sums(from_numpy(mi.Float, np.concatenate(weights)), 2)
-    for view, region, image, weight, part in zip(
-        views, group.regions, images, weights, sums, strict=True
-    ):
-        blocks = replace(view, region=region)
+    for view, image, weight, part in zip(views, images, weights, sums, strict=True):
+        blocks = replace(view, region=view.drawn)
         assert_close(image, np.asarray(render_view(active, blocks).color), rtol=1e-6, atol=1e-6)
         assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
@@ -89,10 +86,9 @@ def test_view_group__crops_images_of_its_views(gaussians):
         np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width))
         for k, v in enumerate(group.views)
     ]
-    for region, image, part in zip(
-        group.regions, images, split(group, group.crop(images)), strict=True
-    ):
-        assert np.array_equal(part, region.crop(image))
+    parts = split(group, group.crop(images))
+    for view, image, part in zip(group.views, images, parts, strict=True):
+        assert np.array_equal(part, view.drawn.crop(image))
 
 
 def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):

@@ -36,7 +36,7 @@ from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.method.flow import observe_key_views
+from morgs_mi.method.flow import ViewFlow, observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.method.ssim import Target
@@ -262,7 +262,8 @@ class _Clips:
         problem = FirstFrameProblem.of(fit_views, points, fit, RenderConfig(), rng)
         gaussians = fit_first_frame(problem, fit, rng).gaussians
         views = [ActiveView(camera) for camera in self.cameras]
-        flow = lift_flow(gaussians, {v: views[v] for v in self.train}, observe_key_views(pairs))
+        observed = observe_key_views(pairs)
+        flow = lift_flow(gaussians, [ViewFlow(views[v], observed[v]) for v in self.train])
         gaussians = replace(gaussians, motion=flow.displacement)
         targets = list(map(Target, images, self.masks))
         train = np.isin(np.arange(len(views)), self.train)
