@@ -13,7 +13,7 @@ frame, each Gaussian is left out with probability p, and the opacities of the ot
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -323,10 +323,17 @@ def density_rounds(config: FitConfig) -> list[int]:
     return sorted(set(steps.astype(int).tolist()))
 
 
+@dataclass(frozen=True, eq=False)
+class MotionMask:
+    """Motion mask of a view (eq. 10)."""
+
+    camera: Camera  #: The view.
+    mask: np.ndarray  #: [H, W] bool.
+
+
 def fit_confidence(
     gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    masks: Mapping[int, np.ndarray],
+    masks: Sequence[MotionMask],
     config: FitConfig,
     render: RenderConfig,
     rng: np.random.Generator,
@@ -336,8 +343,7 @@ def fit_confidence(
 
     Args:
         gaussians: N Gaussians with a confidence.
-        cameras: of all views.
-        masks: motion masks [H, W], by view index.
+        masks: of the key views.
         config: steps and rates.
         render: cut-offs.
         rng: draws the views.
@@ -345,18 +351,19 @@ def fit_confidence(
     Returns:
         The Gaussians with the learned confidence, and the losses by name.
     """
-    views = {view: ActiveView(cameras[view], render) for view in sorted(masks)}
-    targets = {view: from_numpy(mi.TensorXf, masks[view]) for view in views}
+    views = [
+        (ActiveView(each.camera, render), from_numpy(mi.TensorXf, each.mask)) for each in masks
+    ]
 
-    def losses_at(parameters: Tensors, view: int) -> Tensors:
+    def losses_at(parameters: Tensors, index: int) -> Tensors:
         trial = replace(gaussians, logit_confidence=parameters["logit_confidence"])
-        image = render_view(trial, views[view], ("confidence",), detach_weights=("confidence",))
-        pixel_share = opaque(mi.Float, 1 / (cameras[view].width * cameras[view].height))
-        return {"mask": mask_loss(image.confidence, targets[view], pixel_share)}
+        view, mask = views[index]
+        image = render_view(trial, view, ("confidence",), detach_weights=("confidence",))
+        pixel_share = opaque(mi.Float, 1 / (view.camera.width * view.camera.height))
+        return {"mask": mask_loss(image.confidence, mask, pixel_share)}
 
     rates = {"logit_confidence": config.first_frame_rates.confidence}
-    indices = [*views]
-    order = [indices[k] for k in view_order(len(views), config.confidence_steps, rng)]
+    order = view_order(len(views), config.confidence_steps, rng)
     optimizer = adam({"logit_confidence": gaussians.logit_confidence})
     losses = optimise(optimizer, rates, losses_at, Steps(order))
     return replace(gaussians, **values_of(optimizer)), losses

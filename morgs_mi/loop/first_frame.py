@@ -20,7 +20,12 @@ from morgs_mi.core.view import View, Views
 from morgs_mi.fit.balance import balance_cameras, short_fit_config
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.far_views import PointCloud
-from morgs_mi.fit.first_frame import adapted_to_images, fit_confidence, fit_first_frame
+from morgs_mi.fit.first_frame import (
+    MotionMask,
+    adapted_to_images,
+    fit_confidence,
+    fit_first_frame,
+)
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.image_points import image_points
 from morgs_mi.fit.initialise import (
@@ -45,7 +50,7 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.objective import KeyView
-from morgs_mi.platform.checks import check_type, numbers, require
+from morgs_mi.platform.checks import check_type, numbers
 from morgs_mi.platform.config import config_or_default
 from morgs_mi.platform.extras import extra, places
 from morgs_mi.platform.interrupts import interrupts_raised
@@ -79,7 +84,6 @@ def fit_gaussians(
     points: np.ndarray | None = None,
     point_colors: np.ndarray | None = None,
     config: StreamConfig | None = None,
-    masks: Sequence[np.ndarray | None] | None = None,
     background: ArrayLike | None = None,
     progress: Report | None = None,
 ) -> FittedImages:
@@ -87,7 +91,8 @@ def fit_gaussians(
     with its starts, balance of the cameras, density control and dropout.
 
     Args:
-        sensors: V views, `Camera`s or Mitsuba's `perspective` sensors.
+        sensors: V views: `Camera`s, Mitsuba's `perspective` sensors, or a `View` of a camera with
+            the mask of its valid pixels.
         images: an image [H, W, 3] per view: uint8 in sRGB, linear light as a float array or a
             `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. A dict has them by the
             names of the views.
@@ -96,7 +101,6 @@ def fit_gaussians(
             1000, random ones where views agree (see `seed_points`).
         point_colors: [P, 3], encoded: 1 is white; None: grey.
         config: settings of the first frame and the renderer; None: the defaults.
-        masks: per view [H, W] bool of valid pixels, or None.
         background: colour [3] behind all Gaussians, encoded: 1 is white; or an image [V, H, W, 3],
             as of `Camera`. None: the background of the cameras and the config; if these have none
             and there are no points, the colour that the borders of the images have in common.
@@ -114,7 +118,7 @@ def fit_gaussians(
     points = np.zeros((0, 3)) if points is None else points
     point_colors = np.full(np.shape(points), 0.5) if point_colors is None else point_colors
     check_type("fit_gaussians()", "sensors", sensors, Sequence, "pass a list")
-    cameras = [Camera.of(sensor) for sensor in sensors]
+    views = [s if isinstance(s, View) else View(Camera.of(s)) for s in sensors]
     config = config_or_default("fit_gaussians()", config, StreamConfig())
     if background is not None:
         behind = np.asarray(background)
@@ -122,19 +126,11 @@ def fit_gaussians(
             render = replace(config.render, background=tuple(behind.ravel().tolist()))
             config = replace(config, render=render)
         else:
-            numbers("fit_gaussians()", "background", behind, len(cameras), *behind.shape[1:])
-            cameras = [replace(camera, background=behind[v]) for v, camera in enumerate(cameras)]
-    masks = [None] * len(cameras) if masks is None else masks
-    check_type("fit_gaussians()", "masks", masks, Sequence, "pass a list")
-    require(
-        len(masks) == len(cameras),
-        "fit_gaussians()",
-        f"`masks` must have one mask or None for each of {len(cameras)} views",
-        len(masks),
-        "pass None where all pixels are valid",
-    )
-    pairs = zip(cameras, masks, strict=True)
-    views = [View(camera, mask=mask) for camera, mask in pairs]
+            numbers("fit_gaussians()", "background", behind, len(views), *behind.shape[1:])
+            views = [
+                replace(view, camera=replace(view.camera, background=behind[v]))
+                for v, view in enumerate(views)
+            ]
     setup = over_border(prepare(views, points, point_colors, config), images)
     observed = observe_frame(setup, 0, ImageHistory(), images)
     warn_of_order(images, observed)
@@ -320,14 +316,17 @@ def with_first_confidence(
     motion = config.motion
     if not (key_views and motion.learn_confidence and config.fit.confidence_steps):
         return gaussians
-    masks = {
-        v: motion_mask(
-            view.pair.previous,
-            view.flow.forward_flow,
-            view.flow.forward_reliable,
-            motion.mask_method,
-            motion.masks,
+    masks = [
+        MotionMask(
+            setup.cameras[v],
+            motion_mask(
+                key_views[v].pair.previous,
+                key_views[v].flow.forward_flow,
+                key_views[v].flow.forward_reliable,
+                motion.mask_method,
+                motion.masks,
+            ),
         )
-        for v, view in key_views.items()
-    }
-    return fit_confidence(gaussians, setup.cameras, masks, config.fit, config.render, rng)[0]
+        for v in sorted(key_views)
+    ]
+    return fit_confidence(gaussians, masks, config.fit, config.render, rng)[0]

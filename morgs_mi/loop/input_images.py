@@ -6,6 +6,7 @@ Problems that the images of a frame show: views of one colour, and a cut to anot
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -147,13 +148,12 @@ def image_status(views: Sequence[SeenView]) -> tuple[str, ...]:
     plain = []
     cuts = []
     brightest = 0.0
-    thumbnails = map_in_threads(_thumbnails, views)
-    for view, (image, *previous) in zip(views, thumbnails, strict=True):
-        if _is_plain(image):
-            plain.append(view)
-            brightest = max(brightest, image.mean())
-        elif previous and _is_cut(previous[0], image):
-            cuts.append(view)
+    for each in map_in_threads(_Thumbnails.of, views):
+        if _is_plain(each.image):
+            plain.append(each.view)
+            brightest = max(brightest, each.image.mean())
+        elif each.previous is not None and _is_cut(each.previous, each.image):
+            cuts.append(each.view)
     sentences = []
     if plain:
         color = "black" if brightest < _BLACK else "of one colour"
@@ -178,10 +178,21 @@ def _list(views: Sequence[SeenView]) -> str:
     return ", ".join(view.name or f"view {view.index}" for view in views)
 
 
-def _thumbnails(view: SeenView) -> list[np.ndarray]:
-    """Return thumbnails of a view's image, and of the one of the frame before if there is one."""
-    images = [view.image] if view.previous is None else [view.image, view.previous]
-    return [thumbnail(image, _WIDTH).astype(np.float64) for image in images]
+@dataclass(frozen=True, eq=False)
+class _Thumbnails:
+    """A view with thumbnails of its images."""
+
+    view: SeenView
+    image: np.ndarray  # of its image
+    previous: np.ndarray | None  # of the one of the frame before, if there is one
+
+    @classmethod
+    def of(cls, view: SeenView) -> _Thumbnails:
+        """Return a view with its thumbnails."""
+        image = thumbnail(view.image, _WIDTH).astype(np.float64)
+        if view.previous is None:
+            return cls(view, image, None)
+        return cls(view, image, thumbnail(view.previous, _WIDTH).astype(np.float64))
 
 
 def _is_plain(image: np.ndarray) -> bool:

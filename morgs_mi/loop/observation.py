@@ -249,7 +249,7 @@ def _seen_views(
             history=ViewHistory(image, reference, exposure),
         )
 
-    views = dict(zip(recorded, map_in_threads(seen_view, recorded), strict=True))
+    views = {view.index: view for view in map_in_threads(seen_view, recorded)}
     histories = {v: replace(view, image=None) for v, view in history.views.items()}
     histories |= {v: view.history for v, view in views.items()}
     kind = next((image.dtype.name for image in recorded.values()), history.kind)
@@ -264,19 +264,14 @@ def _exposures(
     """
     views = [v for v in images if v in history.views]
     pairs = map_in_threads(
-        lambda v: (
-            *reduced(history.views[v].reference, images[v], setup.views[v].mask),
-            history.views[v].exposure,
-        ),
-        views,
+        lambda v: (v, reduced(history.views[v].reference, images[v], setup.views[v].mask)), views
     )
     # A fit is many short operations, for which threads would only wait for each other.
-    exposures = [fit_exposure(*pair) for pair in pairs]
-    light = common_change(exposures)
-    relative = [exposure.without(light) for exposure in exposures]
+    exposures = {v: fit_exposure(*pair, history.views[v].exposure) for v, pair in pairs}
+    light = common_change([*exposures.values()])
+    relative = {v: exposure.without(light) for v, exposure in exposures.items()}
     # The identity where an exposure hardly changes an image.
-    visible = [e if e.change > LEAST_CHANGE else Exposure() for e in relative]
-    return dict(zip(views, visible, strict=True))
+    return {v: e if e.change > LEAST_CHANGE else Exposure() for v, e in relative.items()}
 
 
 def _key_views(setup: Setup, frame: int, views: Mapping[int, SeenView]) -> dict[int, KeyView]:

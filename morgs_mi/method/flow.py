@@ -71,8 +71,7 @@ def observe_key_views(
         ValueError: a method is not registered, or as its factory.
     """
     source = FLOW_SOURCES.make(method, flow)
-    flows = map_in_threads(lambda pair: _checked_flow(source, pair), pairs.values())
-    observations = dict(zip(pairs, flows, strict=True))
+    observations = dict(map_in_threads(lambda v: (v, _checked_flow(source, pairs[v])), pairs))
     if not mask_method:
         return observations
     # Eqs. 9 and 10.

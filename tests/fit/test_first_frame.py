@@ -11,7 +11,12 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.core.view import View
-from morgs_mi.fit.first_frame import density_rounds, fit_confidence, fit_first_frame
+from morgs_mi.fit.first_frame import (
+    MotionMask,
+    density_rounds,
+    fit_confidence,
+    fit_first_frame,
+)
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.fit.view import rendered
 from morgs_mi.method.objective import ObjectiveConfig
@@ -289,15 +294,16 @@ def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images)
 
 
 def learned(steps, masks):
-    """Return the opaque ball with a confidence that follows masks, by view."""
+    """Return the opaque ball with a confidence that follows motion masks."""
     config = dataclasses.replace(CONFIG, confidence_steps=steps)
     start = dataclasses.replace(opaque_ball(), logit_confidence=np.zeros(400))
-    return fit_confidence(start, views(), masks, config, RenderConfig(), np.random.default_rng(0))
+    return fit_confidence(start, masks, config, RenderConfig(), np.random.default_rng(0))
 
 
 def halves():
-    """Return masks of two key views, which mark their right half."""
-    return {view: np.float32(np.tile(np.arange(64) >= 32, (48, 1))) for view in (0, 3)}
+    """Return motion masks of two key views, which mark their right half."""
+    mask = np.tile(np.arange(64) >= 32, (48, 1))
+    return [MotionMask(views()[view], mask) for view in (0, 3)]
 
 
 def test_fit_confidence__follows_the_masks_of_its_key_views():

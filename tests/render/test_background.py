@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, RenderConfig, StreamLoop, fit_gaussians, rasterize
+from morgs_mi import Camera, RenderConfig, StreamLoop, View, fit_gaussians, rasterize
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.reader import StreamReader
@@ -102,6 +102,10 @@ def test_camera__resizes_and_refuses_backgrounds():
         (
             {"background": 3 * (1e30,)},
             "`background` must be a list, each item .* at most 32.0, got",
+        ),
+        (
+            {"sensors": [View(CAMERA, mask=np.ones((2, 3), bool))]},
+            r"the mask must be bool \[.*, got .*2, 3",
         ),
         ({"background": 1.0}, r"`background` must be a list of 3 items, got \(1.0,\)"),
         ({"background": np.full((1, H, W, 3), 1e11)}, "`background` must have numbers from -32 to"),
