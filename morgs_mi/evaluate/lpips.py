@@ -65,13 +65,10 @@ class Lpips:
             ValueError: the sizes differ, or the network does not accept images of that size, has
                 another output, or returns NaN or infinity.
         """
-        pair = unit_pair("Lpips", image, truth)
-        H, W = pair[0].shape[:2]
-        blobs = {
-            name: np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32)
-            for name, each in zip(_INPUTS, pair, strict=True)
-        }
-        distance = next(iter(self._network.run(blobs).values()))
+        image, truth = unit_pair("Lpips", image, truth)
+        H, W = image.shape[:2]
+        inputs = {"in0": _network_input(image), "in1": _network_input(truth)}
+        distance = next(iter(self._network.run(inputs).values()))
         require(
             distance.size in (1, H * W),
             self.path,
@@ -80,3 +77,8 @@ class Lpips:
             _ADVICE,
         )
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))
+
+
+def _network_input(image: np.ndarray) -> np.ndarray:
+    """Return an image [H, W, 3] of 1 as the network takes it, [1, 3, H, W] from -1 to 1."""
+    return np.ascontiguousarray(2 * image.transpose(2, 0, 1)[None] - 1, np.float32)

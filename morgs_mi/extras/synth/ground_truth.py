@@ -9,7 +9,6 @@ trajectories.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +35,7 @@ class SurfacePoints:
 
 
 def move_with_objects(
-    surface: SurfacePoints, poses: Sequence[np.ndarray], new_poses: Sequence[np.ndarray]
+    surface: SurfacePoints, poses: np.ndarray, new_poses: np.ndarray
 ) -> np.ndarray:
     """Return the positions [..., 3] of surface points after the motion of their objects.
 
@@ -44,31 +43,30 @@ def move_with_objects(
 
     Args:
         surface: points on the objects at `poses`.
-        poses: object-to-world [4, 4] of each object.
+        poses: object-to-world of the objects [O, 4, 4], by their ids.
         new_poses: the same after the motion.
     """
     positions = surface.positions.copy()
-    for index, (pose, new_pose) in enumerate(zip(poses, new_poses, strict=True)):
-        if not np.array_equal(pose, new_pose):
-            points = surface.ids == index
-            motion = new_pose @ np.linalg.inv(pose)
-            positions[points] = surface.positions[points] @ motion[:3, :3].T + motion[:3, 3]
+    for moving in np.flatnonzero((poses != new_poses).any(axis=(1, 2))):
+        points = surface.ids == moving
+        motion = new_poses[moving] @ np.linalg.inv(poses[moving])
+        positions[points] = surface.positions[points] @ motion[:3, :3].T + motion[:3, 3]
     return positions
 
 
 def compute_ground_truth(
     camera: Camera,
     surface: SurfacePoints,
-    poses: Sequence[np.ndarray],
-    before: Sequence[np.ndarray] | None,
-    after: Sequence[np.ndarray],
+    poses: np.ndarray,
+    before: np.ndarray | None,
+    after: np.ndarray,
 ) -> GroundTruth:
     """Return the ground truth of a frame from the surface points at its pixel centres.
 
     Args:
         camera: the view.
         surface: the points [H, W].
-        poses: object-to-world [4, 4] of each object in this frame.
+        poses: object-to-world of the objects in this frame [O, 4, 4], by their ids.
         before: the same in the previous frame; None in the first frame.
         after: the same in the next frame, which determines the mask of the first frame.
     """

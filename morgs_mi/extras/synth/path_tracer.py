@@ -115,12 +115,14 @@ class PathTracer:
         """Whether the scene has an emitter."""
         return bool(self._scene.emitters())
 
-    def poses(self, time: float) -> list[np.ndarray]:
-        """Return each object's pose [4, 4] at `time` in seconds."""
-        return [
-            np.eye(4) if item.pose is None else item.pose(time)
-            for item in self.scene.objects.values()
-        ]
+    def poses(self, time: float) -> np.ndarray:
+        """Return the poses of the objects [O, 4, 4], by their ids, at `time` in seconds."""
+        return np.stack(
+            [
+                np.eye(4) if item.pose is None else item.pose(time)
+                for item in self.scene.objects.values()
+            ]
+        )
 
     def set_time(self, time: float) -> None:
         """Set the poses of all objects and lamps, and the exposure, to `time` in seconds."""

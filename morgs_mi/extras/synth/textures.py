@@ -6,7 +6,6 @@ pixels. Unlike white noise, a 1/f spectrum has the same contrast at any distance
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -16,6 +15,7 @@ from morgs_mi.core.types import SceneDict
 from morgs_mi.extras.synth.scene import Light, Object
 
 RGB = tuple[float, float, float]
+Vector = tuple[float, float, float]
 _SIZE = 512  # texels across
 
 
@@ -104,9 +104,7 @@ def room(
     }
 
 
-def _wall(
-    center: Sequence[float], axis: Sequence[float], angle: float, half_size: Sequence[float]
-) -> Any:
+def _wall(center: Vector, axis: Vector, angle: float, half_size: tuple[float, float]) -> Any:
     """Return the transform of a rectangle with a centre, a rotation in degrees and a half size."""
     return mi.ScalarTransform4f().translate(center).rotate(axis, angle).scale([*half_size, 1])
 
@@ -116,24 +114,18 @@ def lights() -> dict[str, Light]:
     shadows.
     """
     return {
-        "lamp": _lamp((1.6, 5.0, 2.6), (0, 0.4, 0), (0, 0, 1), 0.6, [50.0, 46.0, 40.0]),
-        "fill": _lamp((-2.0, 3.6, 5.5), (0, 0.8, 0), (0, 1, 0), 0.8, [14.0, 15.0, 17.0]),
+        "lamp": _lamp((1.6, 5.0, 2.6), (0, 0.4, 0), (0, 0, 1), 0.6, (50.0, 46.0, 40.0)),
+        "fill": _lamp((-2.0, 3.6, 5.5), (0, 0.8, 0), (0, 1, 0), 0.8, (14.0, 15.0, 17.0)),
     }
 
 
-def _lamp(
-    origin: Sequence[float],
-    target: Sequence[float],
-    up: Sequence[float],
-    half_size: float,
-    radiance: list[float],
-) -> Light:
+def _lamp(origin: Vector, target: Vector, up: Vector, half_size: float, radiance: RGB) -> Light:
     """Return a square lamp that faces a point."""
     look = mi.ScalarTransform4f().look_at(origin=origin, target=target, up=up)
     return Light(
         {
             "type": "rectangle",
             "to_world": look.scale([half_size, half_size, 1]),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(radiance)}},
         }
     )
