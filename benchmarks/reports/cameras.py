@@ -31,6 +31,7 @@ from benchmarks.reports.plots import grouped, markdown, span
 from benchmarks.reports.registration import register_camera
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
@@ -193,14 +194,12 @@ def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
     capture = synthetic("random", path, SynthConfig(frames=1, seed=seed, disturbances=disturbances))
     if not denied.exists():
         truth = load_disturbances(path / "truth")
-        lenses = [
-            truth[n].lens if v in capture.test_views else Lens()
-            for v, n in enumerate(capture.names)
+        images = [
+            CalibratedImage(view.camera, truth[view.name].lens if view.held_out else Lens())
+            for view in capture.views
         ]
         shutil.copytree(path, denied)
-        write_colmap(
-            denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses
-        )
+        write_colmap(denied / "sparse" / "0", images, capture.points, capture.point_colors)
     return path, denied
 
 

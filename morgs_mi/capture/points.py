@@ -40,14 +40,14 @@ def match_capture(
         progress: called with (views done, views).
     """
     capture = capture.displayed().at_recorded_size()
-    images = next(capture.partial_frames(0, 1)).images
+    views = next(capture.partial_frames(0, 1)).views
     progress = progress or (lambda done, count: None)
     features = []
-    for image, mask in zip(images, capture.masks, strict=True):
-        progress(len(features), len(images))
-        features.append(detect(image, mask))
+    for view in views:
+        progress(len(features), len(views))
+        features.append(detect(view.image if view.has_image else None, view.mask))
     matches = match_views(features, capture.cameras)
-    progress(len(images), len(images))
+    progress(len(views), len(views))
     return SharedFeatures(tuple(features), tuple(matches))
 
 

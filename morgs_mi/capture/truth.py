@@ -18,8 +18,6 @@ from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.listing import existing_file
 from morgs_mi.platform.bounded import array_names, read_array
 
-_CHANNELS = ("motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y")
-
 
 @dataclass(frozen=True)
 class GroundTruth:
@@ -63,8 +61,14 @@ def save_truth(folder: str | Path, camera: str, frame: int, truth: GroundTruth) 
     """
     path = _path(folder, camera, frame)
     path.parent.mkdir(parents=True, exist_ok=True)
-    values = (truth.motion[..., 0], truth.motion[..., 1], truth.depth, truth.ids, truth.mask)
-    write_exr(path, dict(zip(_CHANNELS, values, strict=True)))
+    channels = {
+        "motion.X": truth.motion[..., 0],
+        "motion.Y": truth.motion[..., 1],
+        "depth.Y": truth.depth,
+        "id.Y": truth.ids,
+        "mask.Y": truth.mask,
+    }
+    write_exr(path, channels)
 
 
 def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
@@ -78,10 +82,14 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     path = _path(folder, camera, frame)
     channels = read_exr(path)
     try:
-        x, y, depth, ids, mask = (channels[name] for name in _CHANNELS)
+        return GroundTruth(
+            np.stack([channels["motion.X"], channels["motion.Y"]], axis=-1),
+            channels["depth.Y"],
+            channels["id.Y"].astype(np.int32),
+            channels["mask.Y"] > 0.5,
+        )
     except KeyError as error:
         raise ValueError(f"{path}: expected a channel {error}; synthesise it again.") from None
-    return GroundTruth(np.stack([x, y], axis=-1), depth, ids.astype(np.int32), mask > 0.5)
 
 
 def load_tracks(folder: str | Path) -> Tracks:

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.timeline import ReadConfig
@@ -27,10 +28,12 @@ from tests.scenes.captures import (
     videos,
 )
 
+PINHOLE = Lens()
 
-def colmap(path, **kwargs):
+
+def colmap(path):
     names = ("cam01", "cam02")
-    write_colmap(path / "sparse" / "0", rig(names, shift=3.0), **kwargs)
+    write_colmap(path / "sparse" / "0", rig(names, shift=3.0))
     videos(path, names, ".mp4")
     return path
 
@@ -133,9 +136,8 @@ def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path):
     cameras = [square(camera) for camera in capture.cameras]
     recording = capture.with_cameras(cameras).with_cameras(cameras, [terms] * len(cameras))
     points = np.zeros((1, 3))
-    write_colmap(
-        path / "sparse" / "0", cameras, points, points, [Lens("RADIAL", terms)] * len(cameras)
-    )
+    images = [CalibratedImage(camera, Lens("RADIAL", terms)) for camera in cameras]
+    write_colmap(path / "sparse" / "0", images, points, points)
     expected = load_capture(path)
     for images in zip(*(next(c.frames(0, 1)).images for c in (expected, recording)), strict=True):
         assert np.array_equal(*images)
@@ -214,9 +216,9 @@ def transparent(t=0, kind=np.uint8):
     return image
 
 
-def with_images(path, images, **kwargs):
+def with_images(path, images, lens=PINHOLE):
     """Write a capture of one camera with images of any channels and type."""
-    write_colmap(path / "sparse", [make_camera(0, "cam01")], **kwargs)
+    write_colmap(path / "sparse", [CalibratedImage(make_camera(0, "cam01"), lens)])
     (path / "cam01").mkdir()
     for t, image in enumerate(images):
         cv2.imwrite(str(path / "cam01" / f"{t}.png"), image)
@@ -249,7 +251,7 @@ def test_load_capture__masks_what_transparent_pixels_contribute_to(tmp_path, sma
     lens = Lens("SIMPLE_RADIAL", (0.05,))
     images = [transparent()] * 2
     images[0][images[0][..., 3] < 255, :3] = 0
-    capture = load_capture(with_images(tmp_path, images, lenses=[lens]), 2)
+    capture = load_capture(with_images(tmp_path, images, lens), 2)
     (image,) = next(capture.frames()).images
     assert 0.5 < capture.masks[0].mean() < 1
     assert (image[capture.masks[0]] == 255).all(), "no black has leaked into a valid pixel"

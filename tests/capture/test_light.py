@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.interpolation import image_between
+from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.color_space import TRANSFER, display_image
@@ -18,6 +19,9 @@ from tests.scenes.captures import HEIGHT, WIDTH, rig
 NAMES = ("cam01", "cam02")
 
 
+PINHOLE = Lens()
+
+
 def light(camera, frame):
     rng = np.random.default_rng([camera, frame])
     image = 0.5 * rng.random((HEIGHT, WIDTH, 3), np.float32)
@@ -25,8 +29,9 @@ def light(camera, frame):
     return image
 
 
-def recorded(path, alpha=None, **kwargs):
-    write_colmap(path / "sparse" / "0", rig(NAMES, shift=3.0), **kwargs)
+def recorded(path, alpha=None, lens=PINHOLE):
+    images = [CalibratedImage(camera, lens) for camera in rig(NAMES, shift=3.0)]
+    write_colmap(path / "sparse" / "0", images)
     for camera, name in enumerate(NAMES):
         (path / name).mkdir(parents=True)
         for frame in range(2):
@@ -81,7 +86,7 @@ def test_process__averages_light_when_it_downscales(tmp_path):
 
 def test_process__keeps_light_positive_through_undistortion(tmp_path):
     lens = Lens("SIMPLE_RADIAL", (0.05,))
-    image = next(load_capture(recorded(tmp_path, lenses=[lens] * 2)).frames()).images[0]
+    image = next(load_capture(recorded(tmp_path, lens=lens)).frames()).images[0]
     assert image.min() >= 0
     assert image.max() > 4
 

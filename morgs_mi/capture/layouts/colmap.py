@@ -34,7 +34,7 @@ from morgs_mi.capture.layouts.colmap_files import (
     read_points,
 )
 from morgs_mi.capture.layouts.nerfstudio import read_points_ply
-from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
+from morgs_mi.capture.lens import MODELS, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.listing import existing_file
 from morgs_mi.io.numbering import natural_key
@@ -136,32 +136,32 @@ def read_colmap(folder: str | Path) -> ColmapModel:
 
 def write_colmap(
     folder: str | Path,
-    cameras: Sequence[Camera],
+    images: Sequence[Camera | CalibratedImage],
     points: np.ndarray = NO_POINTS,
     point_colors: np.ndarray | None = None,
-    lenses: Sequence[Lens] | None = None,
 ) -> None:
     """Write a COLMAP text model that COLMAP itself can read.
 
     Args:
         folder: created if missing.
-        cameras: the views; the image of a view is called `name`, with ``.png`` added if it has no
-            suffix.
+        images: cameras, with their lenses if these are not pinholes; an image is called `name`,
+            with ``.png`` added if that has no suffix.
         points: [P, 3] world units; none by default.
         point_colors: [P, 3] in [0, 1]; grey if None.
-        lenses: one per camera, as in `ColmapModel`; pinholes if None.
 
     Raises:
         OSError: a file could not be written.
     """
     folder = Path(folder)
-    lenses = [Lens()] * len(cameras) if lenses is None else lenses
     points = np.asarray(points, np.float64)
     colors = np.full(points.shape, 0.5) if point_colors is None else np.asarray(point_colors)
     colors = np.rint(np.clip(colors, 0, 1) * 255).astype(int)
     image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points\n"]
     camera_lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n"]
-    for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
+    for i, image in enumerate(images, start=1):
+        image = image if isinstance(image, CalibratedImage) else CalibratedImage(image)
+        camera = image.camera
+        lens = image.lens
         viewmat = camera.world_to_camera
         x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat(canonical=True).tolist()
         name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"

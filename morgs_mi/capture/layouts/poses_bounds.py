@@ -63,8 +63,8 @@ def _read_calibration(path: Path) -> Calibration:
         check_frames(path, next(iter(by_frame.values())))
         clips = by_frame
     cameras = read_poses_bounds(source, list(clips))
-    pairs = zip(cameras, clips.values(), strict=True)
-    return Calibration(tuple(CalibratedView(camera, clip=clip) for camera, clip in pairs))
+    views = (CalibratedView(camera, clip=clips[camera.name]) for camera in cameras)
+    return Calibration(tuple(views))
 
 
 READER = Reader(

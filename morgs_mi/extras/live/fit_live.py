@@ -162,10 +162,9 @@ def begin_capture(
         if calibration is not None:
             write_colmap(
                 folder / "sparse" / "0",
-                [view.camera for view in calibration.views],
+                calibration.views,
                 calibration.points,
                 calibration.point_colors,
-                [view.lens for view in calibration.views],
             )
         else:
             calibrate = extra("cameras", "calibrate")

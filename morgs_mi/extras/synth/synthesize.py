@@ -16,6 +16,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.outputs import check_output
@@ -342,14 +343,13 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
 
     The points have the colours of the `clips`, one per camera.
     """
-    lenses = [camera.disturbance.lens for camera in rig.cameras]
     rng = np.random.default_rng([rig.config.seed, 2])
     points = []
     colors = []
     for index, camera in enumerate(rig.cameras):
         view = camera.view
         tracer.set_time(camera.disturbance.time_offset / rig.config.fps)
-        lens = undistortion(view, lenses[index])
+        lens = undistortion(view, camera.disturbance.lens)
         surface = tracer.surface_points(view)
         # The pixels with a surface that the lens shows.
         pixels = np.flatnonzero((surface.ids >= 0) & (lens is None or lens.mask))
@@ -366,9 +366,9 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
         image = next(open_frames(clips[index]).frames(0, 1))
         image = image if lens is None else lens(image)
         colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)
-    write_colmap(
-        folder / "sparse" / "0", rig.views, np.concatenate(points), np.concatenate(colors), lenses
-    )
+    images = [CalibratedImage(camera.view, camera.disturbance.lens) for camera in rig.cameras]
+    model = folder / "sparse" / "0"
+    write_colmap(model, images, np.concatenate(points), np.concatenate(colors))
 
 
 def stored_settings(folder: Path) -> JsonObject:

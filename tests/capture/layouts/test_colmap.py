@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import find_models, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.testing import assert_close
@@ -33,7 +34,7 @@ LENSES = [
 
 
 def write(folder, kind="txt"):
-    write_colmap(folder, cameras(), POINTS, COLORS, LENSES)
+    write_colmap(folder, list(map(CalibratedImage, cameras(), LENSES)), POINTS, COLORS)
     return as_binary(folder) if kind == "bin" else folder
 
 

@@ -13,6 +13,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.extras.live.sources import live_frames
@@ -26,8 +27,9 @@ NAMES = ("cam1", "cam2", "cam3")
 @pytest.fixture
 def rig(tmp_path, small_images):
     """Three cameras at half size, the second with lens distortion."""
-    lenses = [Lens(), Lens("SIMPLE_RADIAL", (0.2,)), Lens()]
-    write_colmap(tmp_path / "rig/sparse/0", layouts.rig(NAMES), lenses=lenses)
+    first, second, third = layouts.rig(NAMES)
+    second = CalibratedImage(second, Lens("SIMPLE_RADIAL", (0.2,)))
+    write_colmap(tmp_path / "rig/sparse/0", [first, second, third])
     for name in NAMES:
         write_video(tmp_path / "rig" / f"{name}.mkv", clip(), 25)
     return load_capture(tmp_path / "rig", downscale=2)
