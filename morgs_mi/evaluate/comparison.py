@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameSource, FrameState
@@ -75,7 +75,7 @@ class ComparedClip:
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
-        last: Mapping[int, np.ndarray] = {}
+        last: dict[int, np.ndarray] = {}
         stops = self.recording.display_exposure or 0.0
         # The file may have grown since it was read.
         states = islice(self.stream.states(), len(self.packets))
@@ -83,12 +83,12 @@ class ComparedClip:
         for state, frame in zip(states, recorded, strict=True):
             kind, num_bytes = self.packets[state.frame]
             images = {
-                view: display_image(image, stops)
-                for view, image in enumerate(frame.images)
-                if image is not None
+                index: RecordedImage(display_image(view.image, stops), last.get(index), view.image)
+                for index, view in enumerate(frame.views)
+                if view.has_image
             }
-            yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)
-            last = images
+            yield ComparedFrame(self, state, kind, num_bytes, frame, images)
+            last = {index: recorded.image for index, recorded in images.items()}
 
 
 def nearest_views(recording: Capture, cameras: Sequence[Camera]) -> dict[int, int]:
@@ -102,6 +102,15 @@ def nearest_views(recording: Capture, cameras: Sequence[Camera]) -> dict[int, in
 
 
 @dataclass(frozen=True, eq=False)
+class RecordedImage:
+    """Recorded image of a view in one frame."""
+
+    image: np.ndarray  #: [H, W, 3], as a display shows it.
+    last: np.ndarray | None  #: Likewise of the frame before; None: there is none.
+    light: np.ndarray  #: The image as it was recorded.
+
+
+@dataclass(frozen=True, eq=False)
 class ComparedFrame:
     """A decoded frame and the recorded one."""
 
@@ -109,28 +118,27 @@ class ComparedFrame:
     state: FrameState  #: Its Gaussians.
     kind: PacketKind  #: Kind of the frame's packet.
     num_bytes: int  #: Its size.
-    #: Recorded images [H, W, 3] by view, as a display shows them, without missing ones.
-    images: Mapping[int, np.ndarray]
-    last: Mapping[int, np.ndarray]  #: Likewise of the frame before; none in the first one.
-    recorded: Sequence[np.ndarray | None]  #: The images as they were recorded; None: missing.
+    recorded: PartialFrame  #: The recorded frame.
+    images: Mapping[int, RecordedImage]  #: Its images by view index, without missing ones.
 
     def views(self) -> Iterator[ComparedView]:
         """Render and yield the evaluated views, except those without an image."""
         clip = self.clip
         for index in clip.views:
             camera = clip.cameras[index]
-            image = self.images.get(index)
-            if image is not None:
+            recorded = self.images.get(index)
+            if recorded is not None:
                 maps = render(self.state.gaussians, camera, clip.channels, clip.render)
                 truth = truth_for_camera(clip.recording, camera, self.state.frame)
                 moving = None if truth is None else truth.mask
-                last_image = self.last.get(index)
-                if last_image is not None and clip.recording.truth is None:
-                    moving = recorded_change(last_image, image)
+                if recorded.last is not None and clip.recording.truth is None:
+                    moving = recorded_change(recorded.last, recorded.image)
                 nearest = clip.nearest.get(index)
-                copy = None if nearest is None else self.images.get(nearest)
-                light = None if clip.recording.display_exposure is None else self.recorded[index]
+                near_image = None if nearest is None else self.images.get(nearest)
+                copy = None if near_image is None else near_image.image
+                light = None if clip.recording.display_exposure is None else recorded.light
                 valid = clip.recording.masks[index]
+                image = recorded.image
                 yield ComparedView(self, index, maps, image, valid, moving, truth, light, copy)
 
 

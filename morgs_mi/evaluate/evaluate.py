@@ -86,7 +86,6 @@ def evaluate_stream(
     variations = {view: StillVariation(recording.masks[view], false_alarms) for view in clip.views}
     motion = Motion3D(clip)
     rows: list[FrameScores] = []
-    without_images = []
     for frame in clip.frames():
         # Unknown without an image.
         views = {clip.cameras[view].name: ViewScores() for view in clip.views}
@@ -95,7 +94,7 @@ def evaluate_stream(
             variations[view.index].add(view.rendered, view.recorded, view.moving)
         index = frame.state.frame
         report = fitted.get(index, _FitReport())
-        pairs = zip(report.fingerprints, image_fingerprints(frame.recorded), strict=False)
+        pairs = zip(report.fingerprints, image_fingerprints(frame.recorded.images), strict=False)
         # An image may have been missing in the fit, or may be missing now.
         if not any_recording and any(a != b for a, b in pairs if a and b):
             raise ValueError(
@@ -104,13 +103,18 @@ def evaluate_stream(
                 "any recording (--any-recording)."
             )
         scores = ViewScores.mean(list(views.values()))
-        if np.isnan(scores.psnr) or report.num_missing == len(recording.views.train):
-            without_images.append(index)
-        kind = frame.kind.name.lower()
-        errors = motion.scores(frame)
-        rows.append(
-            FrameScores(index, kind, frame.num_bytes, report.seconds, scores, errors, views)
+        was_fitted = report.num_missing < len(recording.views.train)
+        row = FrameScores(
+            index,
+            frame.kind.name.lower(),
+            frame.num_bytes,
+            report.seconds,
+            scores,
+            motion.scores(frame),
+            views,
+            has_images=was_fitted and not np.isnan(scores.psnr),
         )
+        rows.append(row)
         if progress is not None:
             progress(len(rows), len(clip.packets))
     num_bytes = stream.path.stat().st_size
@@ -128,7 +132,6 @@ def evaluate_stream(
         held_out=bool(recording.test_views),
         between_cameras=between_cameras(stream),
         complete=len(rows) == stream.metadata.get("num_frames", len(rows)),
-        without_images=tuple(without_images),
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=sizes,
         variation=VariationScores.mean([each.result() for each in variations.values()]),

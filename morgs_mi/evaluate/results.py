@@ -103,10 +103,13 @@ class FrameScores:
     scores: ViewScores  #: Means over the views.
     motion_3d: Motion3DScores | None  #: Errors in 3D; None without tracks or a previous frame.
     views: Mapping[str, ViewScores]  #: Scores by camera name.
+    #: Whether it was fitted with an image and an evaluated view has one.
+    has_images: bool = True
 
     def as_dict(self) -> JsonObject:
         """Return the frame's row of the JSON."""
         row = asdict(self)
+        del row["has_images"]  # the clip's row names such frames
         scores, motion, views = map(row.pop, ("scores", "motion_3d", "views"))
         return {**row, **scores, "motion_3d": motion or {}, "views": views}
 
@@ -149,8 +152,6 @@ class Evaluation:
     #: Quality that the fit expects of views between the cameras; empty: it is not known.
     between_cameras: str
     complete: bool  #: Whether the stream holds all frames that were to be fitted.
-    #: Frames that were fitted without any image, or have none of the evaluated views.
-    without_images: tuple[int, ...]
     regions: str  #: Source of the regions, ``true masks`` or ``recorded change``.
     sizes: Sizes
     variation: VariationScores  #: Mean over the views.
@@ -162,6 +163,11 @@ class Evaluation:
     def num_frames(self) -> int:
         """Number of frames in the stream."""
         return len(self.frames)
+
+    @property
+    def without_images(self) -> tuple[int, ...]:
+        """Frames that were fitted without any image, or have none of the evaluated views."""
+        return tuple(frame.frame for frame in self.frames if not frame.has_images)
 
     @property
     def scores(self) -> ViewScores:
