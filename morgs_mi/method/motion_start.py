@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -45,6 +44,14 @@ class MotionStart:
         return cls(np.zeros((len(gaussians), 3), np.float32), np.array(confidence, np.float32))
 
 
+@dataclass
+class _SumsAt:
+    """The sums of a sweep over displaced Gaussians."""
+
+    displacement: np.ndarray | None = None  # [N, 3]; None: not computed yet
+    sums: Arrays = field(default_factory=dict)  # by map
+
+
 @dataclass(frozen=True, eq=False)
 class MotionProblem:
     """N Gaussians of the previous frame, and images of this one that show their motion."""
@@ -53,7 +60,7 @@ class MotionProblem:
     gaussians: Gaussians
     views: Mapping[int, ObservedView]  #: Active views with their images, by view index.
     rng: np.random.Generator  #: Draws the neighbours that proposals come from.
-    _last: dict[str, Any] = field(default_factory=dict)
+    _last: _SumsAt = field(default_factory=_SumsAt)
 
     @property
     def flows(self) -> list[ViewFlow]:
@@ -74,10 +81,11 @@ class MotionProblem:
         """Return the sums of all maps of a sweep, with the Gaussians displaced by d [N, 3]; kept
         until d is another.
         """
-        if self._last.get("displacement") is not displacement:
-            sums = self.images.sums(displaced(self.gaussians, displacement), [*MAPS])
-            self._last.update(displacement=displacement, sums=sums)
-        return self._last["sums"]
+        last = self._last
+        if last.displacement is not displacement:
+            last.sums = self.images.sums(displaced(self.gaussians, displacement), [*MAPS])
+            last.displacement = displacement
+        return last.sums
 
     def images_around(
         self, selection: np.ndarray, displacements: Sequence[np.ndarray]
