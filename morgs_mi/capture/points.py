@@ -8,29 +8,22 @@ downscaled. Smaller images have fewer and less exact features.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.features import Features, Match, detect, match_views
+from morgs_mi.fit.features import SharedFeatures, detect, match_views
 from morgs_mi.fit.image_points import matched_points
 from morgs_mi.fit.stereo import stereo_points
-
-
-@dataclass(frozen=True)
-class SharedFeatures:
-    """Features of a capture's first frame and their matches between views."""
-
-    features: tuple[Features, ...]  #: Per camera, in pixels of the recorded size.
-    matches: tuple[Match, ...]  #: Per pair of cameras with matches.
 
 
 def match_capture(
     capture: Capture, progress: Callable[[int, int], None] | None = None
 ) -> SharedFeatures:
-    """Return the features and matches of the first frame; takes about 0.6 s per view and 0.03 s per
+    """Return the features of the first frame, in pixels of the recorded size, and their matches;
+    takes about 0.6 s per view and 0.03 s per
     pair.
 
     A view without an image has no features.
@@ -46,9 +39,9 @@ def match_capture(
     for view in views:
         progress(len(features), len(views))
         features.append(detect(view.image if view.has_image else None, view.mask))
-    matches = match_views(features, capture.cameras)
+    shared = match_views(features, capture.cameras)
     progress(len(views), len(views))
-    return SharedFeatures(tuple(features), tuple(matches))
+    return shared
 
 
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
@@ -58,8 +51,7 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     points or none, which the fit reports. Held-out views are not used.
     """
     cameras = capture.at_recorded_size().cameras
-    matches = [match for match in shared.matches if not set(capture.test_views) & set(match.views)]
-    points, colors = matched_points(shared.features, matches, cameras, capture.train_views)
+    points, colors = matched_points(shared.without(capture.test_views), cameras)
     return replace(capture, points=points, point_colors=colors)
 
 

@@ -7,7 +7,7 @@ matches. `guided_matching` uses them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -54,11 +54,6 @@ class Match:
     views: tuple[int, int]  #: Indices of the two views.
     features: np.ndarray  #: [M, 2] int, index of the feature in each view.
 
-    def pixels(self, features: Sequence[Features]) -> list[np.ndarray]:
-        """Return the positions [M, 2] of the matched features in each of the two views."""
-        pairs = zip(self.views, self.features.T, strict=True)
-        return [features[view].points[rows] for view, rows in pairs]
-
 
 @dataclass(frozen=True)
 class FeatureTracks:
@@ -81,6 +76,95 @@ class FeatureTracks:
     def count(self) -> int:
         """Number of tracks."""
         return int(self.ids.max(initial=-1)) + 1
+
+
+@dataclass(frozen=True)
+class SharedFeatures:
+    """Features of several views, and the matches between them."""
+
+    features: tuple[Features, ...]  #: Per view.
+    matches: tuple[Match, ...]  #: Per pair of views with matches.
+
+    def without(self, views: Collection[int]) -> SharedFeatures:
+        """Return them without the features of some views, by their indices."""
+        return SharedFeatures(
+            tuple(detect(None) if v in views else f for v, f in enumerate(self.features)),
+            tuple(match for match in self.matches if not {*views} & {*match.views}),
+        )
+
+    def reprojection_errors(self, match: Match, cameras: Sequence[Camera]) -> np.ndarray:
+        """Return the reprojection error of the matches of two views [M], px.
+
+        A match is triangulated from its two features. Its error is the mean distance of the point's
+        projections from the features; it is infinite for a point behind a camera.
+
+        Args:
+            match: one of `matches`, or a part of one.
+            cameras: per view.
+        """
+        first, second = (self.features[view].points for view in match.views)
+        rows, partners = match.features.T
+        pixels = np.concatenate([first[rows], second[partners]])
+        points = intersect_pairs(pixels, match.views, cameras)
+        views = np.repeat(match.views, len(points))
+        return _distances(np.tile(points, (2, 1)), views, pixels, cameras).reshape(2, -1).mean(0)
+
+    def tracks(self) -> FeatureTracks:
+        """Return the tracks of features that are matched directly or through other features, all in
+        different views.
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        starts = np.concatenate([[0], np.cumsum([len(f.points) for f in self.features])])
+        starts = starts.astype(int)
+        edges = [match.features + starts[list(match.views)] for match in self.matches]
+        rows, columns = np.concatenate([np.zeros((0, 2), int), *edges]).T
+        graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(starts[-1], starts[-1]))
+        track = connected_components(graph, directed=False)[1]
+        views = np.repeat(np.arange(len(self.features)), np.diff(starts))
+        # Tracks with at least two features, all in different views.
+        sizes = np.bincount(track)
+        distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
+        members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
+        _, track = np.unique(track[members], return_inverse=True)
+        return FeatureTracks(
+            track,
+            views[members],
+            np.concatenate([f.points for f in self.features])[members],
+            np.concatenate([f.colors for f in self.features])[members],
+        )
+
+    def triangulated(
+        self, cameras: Sequence[Camera], max_error: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the triangulated points [P, 3] float32, world units, and their colours [P, 3] in
+        [0, 1].
+
+        Args:
+            cameras: per view.
+            max_error: largest distance of a point's projection from any of its features, px.
+        """
+        close = []
+        for match in self.matches:
+            good = self.reprojection_errors(match, cameras) <= max_error
+            close.append(replace(match, features=match.features[good]))
+        tracks = replace(self, matches=tuple(close)).tracks()
+        points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
+        distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
+        # The spread of a point's views: twice the largest angle between its rays and their mean.
+        with np.errstate(invalid="ignore"):
+            rays = unit_vectors(points[tracks.ids] - positions_of(cameras)[tracks.views])
+            means = [np.bincount(tracks.ids, axis) for axis in rays.T]
+            mean = unit_vectors(np.stack(means, axis=1))
+            angles = np.rad2deg(np.arccos(np.clip((rays * mean[tracks.ids]).sum(1), -1, 1)))
+        widest = np.zeros(len(points))
+        np.maximum.at(widest, tracks.ids, np.nan_to_num(angles))
+        good = 2 * widest >= MIN_ANGLE
+        good[tracks.ids[distances > max_error]] = False
+        colors = np.stack([np.bincount(tracks.ids, band) for band in tracks.colors.T], axis=1)
+        colors = (colors / np.bincount(tracks.ids)[:, None])[good]
+        return points[good].astype(np.float32), colors.astype(np.float32)
 
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
@@ -121,9 +205,9 @@ def reduced_size(width: int, height: int, pixels: float) -> tuple[int, int]:
     return round(width * scale), round(height * scale)
 
 
-def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
-    """Return the matches between all pairs of up to 24 views, or of each view and its 8 nearest
-    ones.
+def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> SharedFeatures:
+    """Return features with the matches between all pairs of up to 24 views, or of each view and its
+    8 nearest ones.
 
     Only matches that are consistent with a common epipolar geometry are returned, for any such
     geometry.
@@ -153,7 +237,7 @@ def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list
             _, inliers = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
             if np.count_nonzero(inliers) >= _MIN_MATCHES:
                 matches.append(Match((i, j), pairs[inliers.ravel() > 0]))
-    return matches
+    return SharedFeatures(tuple(features), tuple(matches))
 
 
 def descriptor_distances(a: Features, b: Features) -> np.ndarray:
@@ -171,82 +255,6 @@ def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
     first, second = np.partition(distances, 1, axis=1)[:, :2].T
     good = (back[forth] == rows) & (first < _RATIO * second)
     return np.stack([rows, forth], axis=1)[good]
-
-
-def reprojection_errors(
-    match: Match, features: Sequence[Features], cameras: Sequence[Camera]
-) -> np.ndarray:
-    """Return the reprojection error of each match [M], px.
-
-    A match is triangulated from its two features. Its error is the mean distance of the point's
-    projections from the features; it is infinite for a point behind a camera.
-    """
-    pixels = np.concatenate(match.pixels(features))
-    points = intersect_pairs(pixels, match.views, cameras)
-    views = np.repeat(match.views, len(points))
-    return _distances(np.tile(points, (2, 1)), views, pixels, cameras).reshape(2, -1).mean(0)
-
-
-def triangulate(
-    matches: Sequence[Match],
-    features: Sequence[Features],
-    cameras: Sequence[Camera],
-    max_error: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangulated points [P, 3] float32, world units, and their colours [P, 3] in
-    [0, 1].
-
-    Args:
-        matches: from `match_views`.
-        features: per view.
-        cameras: per view.
-        max_error: largest distance of a point's projection from any of its features, px.
-    """
-    close = []
-    for match in matches:
-        good = reprojection_errors(match, features, cameras) <= max_error
-        close.append(replace(match, features=match.features[good]))
-    tracks = join_matches(close, features)
-    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
-    distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
-    # The spread of a point's views: twice the largest angle between its rays and their mean.
-    with np.errstate(invalid="ignore"):
-        rays = unit_vectors(points[tracks.ids] - positions_of(cameras)[tracks.views])
-        mean = unit_vectors(np.stack([np.bincount(tracks.ids, axis) for axis in rays.T], axis=1))
-        angles = np.rad2deg(np.arccos(np.clip((rays * mean[tracks.ids]).sum(1), -1, 1)))
-    widest = np.zeros(len(points))
-    np.maximum.at(widest, tracks.ids, np.nan_to_num(angles))
-    good = 2 * widest >= MIN_ANGLE
-    good[tracks.ids[distances > max_error]] = False
-    colors = np.stack([np.bincount(tracks.ids, band) for band in tracks.colors.T], axis=1)
-    colors = (colors / np.bincount(tracks.ids)[:, None])[good]
-    return points[good].astype(np.float32), colors.astype(np.float32)
-
-
-def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> FeatureTracks:
-    """Return the tracks of features that are matched directly or through other features, all in
-    different views.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])]).astype(int)
-    edges = [match.features + starts[list(match.views)] for match in matches]
-    rows, columns = np.concatenate([np.zeros((0, 2), int), *edges]).T
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(starts[-1], starts[-1]))
-    track = connected_components(graph, directed=False)[1]
-    views = np.repeat(np.arange(len(features)), np.diff(starts))
-    # Tracks with at least two features, all in different views.
-    sizes = np.bincount(track)
-    distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
-    members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
-    _, track = np.unique(track[members], return_inverse=True)
-    return FeatureTracks(
-        track,
-        views[members],
-        np.concatenate([f.points for f in features])[members],
-        np.concatenate([f.colors for f in features])[members],
-    )
 
 
 def intersect(

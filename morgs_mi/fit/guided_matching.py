@@ -16,6 +16,7 @@ from morgs_mi.core.camera import Camera, unit_vectors
 from morgs_mi.fit.features import (
     Features,
     Match,
+    SharedFeatures,
     descriptor_distances,
     intersect_pairs,
     mutual_neighbours,
@@ -32,13 +33,13 @@ _ROUNDING = 1e-9
 
 
 def match_guided(
-    features: Sequence[Features], cameras: Sequence[Camera], pairs: Iterable[tuple[int, int]]
+    shared: SharedFeatures, cameras: Sequence[Camera], pairs: Iterable[tuple[int, int]]
 ) -> list[Match]:
     """Return the matches of pairs of views, found with the poses of their cameras."""
     matches = []
     for i, j in pairs:
-        a = features[i]
-        b = features[j]
+        a = shared.features[i]
+        b = shared.features[j]
         if min(len(a.points), len(b.points)) < 2:
             continue
         distances = descriptor_distances(a, b)
@@ -78,7 +79,7 @@ def _patches_agree(
     a: Features, b: Features, pairs: np.ndarray, first: Camera, second: Camera
 ) -> np.ndarray:
     """Return whether the patches of each pair [M, 2] agree in size and orientation, [M]."""
-    pixels = np.concatenate(Match((0, 1), pairs).pixels((a, b)))
+    pixels = np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]])
     points = intersect_pairs(pixels, (0, 1), (first, second))
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = _carried(points, a.axes[pairs[:, 0]], first, second)

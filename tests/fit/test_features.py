@@ -10,10 +10,9 @@ from morgs_mi.core.rig import seen_points
 from morgs_mi.fit.features import (
     Features,
     Match,
+    SharedFeatures,
     detect,
     match_views,
-    reprojection_errors,
-    triangulate,
 )
 from morgs_mi.testing import assert_close
 from tests.scenes import textured
@@ -32,7 +31,7 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
         for p in (points, places)
     ]
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
-    assert match_views(features, [camera, camera]) == []
+    assert match_views(features, [camera, camera]).matches == ()
 
 
 def test_reprojection_errors__are_bounded_by_epipolar_distances():
@@ -45,9 +44,9 @@ def test_reprojection_errors__are_bounded_by_epipolar_distances():
     pixels = [camera.project(points)[0] for camera in cameras]
     distance = rng.uniform(0, 5, 50)
     pixels[1][:, 1] += distance
-    features = [Features(p, np.zeros((50, 128)), np.zeros((50, 3)), p) for p in pixels]
+    features = tuple(Features(p, np.zeros((50, 128)), np.zeros((50, 3)), p) for p in pixels)
     match = Match((0, 1), np.tile(np.arange(50)[:, None], 2))
-    errors = reprojection_errors(match, features, cameras)
+    errors = SharedFeatures(features, (match,)).reprojection_errors(match, cameras)
     assert (errors >= 0.45 * distance - 1e-6).all()
     assert (errors <= 2 * distance + 1e-6).all()
 
@@ -72,10 +71,8 @@ def test_detect__respects_the_mask(textured_capture):
     assert detect(image, mask).points[:, 0].min() > 158
 
 
-def test_triangulate__finds_points_on_the_planes(textured_capture, textured_features):
-    points, colors = triangulate(
-        textured_features.matches, textured_features.features, textured_capture.cameras, 2.0
-    )
+def test_triangulated__finds_points_on_the_planes(textured_capture, textured_features):
+    points, colors = textured_features.triangulated(textured_capture.cameras, 2.0)
     assert points.dtype == colors.dtype == np.float32
     assert len(points) > 1000
     # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; a few points at occlusion
@@ -90,7 +87,7 @@ def test_triangulate__finds_points_on_the_planes(textured_capture, textured_feat
     assert np.median(np.abs(image[v, u] / 255 - colors[mask])) < 0.05
 
 
-def test_triangulate__leaves_out_points_with_a_small_angle(
+def test_triangulated__leaves_out_points_with_a_small_angle(
     textured_capture, textured_features, monkeypatch
 ):
     counts = []

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from morgs_mi.fit.features import reprojection_errors
+from morgs_mi.fit.features import SharedFeatures
 from morgs_mi.fit.guided_matching import match_guided
 from tests.scenes.textured import turned
 
@@ -13,20 +13,22 @@ def test_match_guided__finds_true_matches_alone(textured_capture, textured_featu
     """Next to none with wrong poses, or of patches of another size or orientation."""
     features = textured_features.features
     cameras = textured_capture.cameras
-    (match,) = match_guided(features, cameras, [(0, 4)])
+    (match,) = match_guided(textured_features, cameras, [(0, 4)])
     assert match.views == (0, 4)
     assert len(match.features) > 100
-    assert reprojection_errors(match, features, cameras).max() < 1
+    assert textured_features.reprojection_errors(match, cameras).max() < 1
     free = next(m for m in textured_features.matches if m.views == (0, 4))
-    partners = dict(free.features[reprojection_errors(free, features, cameras) < 0.2].tolist())
+    is_exact = textured_features.reprojection_errors(free, cameras) < 0.2
+    partners = dict(free.features[is_exact].tolist())
     assert np.mean([partners[a] == b for a, b in match.features.tolist() if a in partners]) > 0.95
-    assert match_guided(features, [cameras[0]] * 6, [(0, 4)]) == []
+    assert match_guided(textured_features, [cameras[0]] * 6, [(0, 4)]) == []
 
     def with_axes(axes):
-        return [*features[:4], replace(features[4], axes=axes), *features[5:]]
+        turned_patches = replace(features[4], axes=axes)
+        return SharedFeatures((*features[:4], turned_patches, *features[5:]), ())
 
     for wrong_features, view in (
-        (features, turned(cameras[4], 90)),
+        (textured_features, turned(cameras[4], 90)),
         (with_axes(2 * features[4].axes), cameras[4]),
         (with_axes(features[4].axes[:, ::-1] * (-1, 1)), cameras[4]),
     ):

@@ -34,7 +34,7 @@ from morgs_mi.extras.calibration.bundle import (
 )
 from morgs_mi.fit.balance import short_fit_config
 from morgs_mi.fit.far_views import PointCloud
-from morgs_mi.fit.features import detect, intersect, join_matches, match_views
+from morgs_mi.fit.features import detect, intersect, match_views
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
@@ -179,7 +179,7 @@ class RefinementProblem:
         cameras = [recording.cameras[v] for v in self.indices]
         images = next(recording.partial_frames(0, 1)).images
         features = [detect(images[v], recording.masks[v]) for v in self.indices]
-        tracks = join_matches(match_views(features, cameras), features)
+        tracks = match_views(features, cameras).tracks()
         if np.bincount(tracks.views, minlength=len(cameras)).min() < _MIN_TRACKS:
             return np.zeros((len(cameras), CHANGES)), 0
         deviations = prior_deviations(self.extent, self.config.camera_priors)

@@ -14,14 +14,13 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.checks.mistakes import (
     focal_candidates,
     rig_candidates,
 )
-from morgs_mi.fit.features import Match, detect, match_views, reprojection_errors
+from morgs_mi.fit.features import Match, SharedFeatures, detect, match_views
 from morgs_mi.fit.image_points import MAX_ERROR
 
 # With a wrong pose a few matches may fit by chance, but not this many.
@@ -141,8 +140,7 @@ def pose_problems(views: Sequence[View]) -> list[str]:
         # In px of one size, as the limits of the errors are.
         features.append(replace(detected, points=detected.points * camera.size / size))
         cameras.append(replace(camera, name=camera.name or f"view {index}"))
-    matches = match_views(features, cameras)
-    check = check_cameras(cameras, "", SharedFeatures(tuple(features), tuple(matches)))
+    check = check_cameras(cameras, "", match_views(features, cameras))
     order = "a list of images has the cameras' order, a dict their names"
     return [f"{check.advice.rstrip('.')}; {order}."] if check.fits is False else []
 
@@ -157,7 +155,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, shared: SharedFeatures, cameras: Sequence[Camera]) -> _Pairs:
-        errors = (reprojection_errors(match, shared.features, cameras) for match in shared.matches)
+        errors = (shared.reprojection_errors(match, cameras) for match in shared.matches)
         return cls(shared, tuple(cameras), tuple(errors))
 
     def of_view(self, view: int, partners: Collection[int] | None = None) -> np.ndarray:

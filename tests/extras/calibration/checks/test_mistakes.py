@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.view import Views
 from morgs_mi.extras.calibration.checks.rig_check import check_rig
 from morgs_mi.fit.features import match_views
@@ -106,7 +105,7 @@ def test_check_rig__refuses_cameras_with_one_pose(capture, shared):
 def with_images(shared, capture, order):
     """Return the features as if camera i had recorded the images of camera order[i]."""
     features = [shared.features[k] for k in order]
-    return SharedFeatures(tuple(features), tuple(match_views(features, capture.cameras)))
+    return match_views(features, capture.cameras)
 
 
 @pytest.mark.slow

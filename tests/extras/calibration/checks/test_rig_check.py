@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
+from morgs_mi.capture.points import match_capture, triangulate_points
 from morgs_mi.core.view import View, Views
 from morgs_mi.extras.calibration.checks.rig_check import check_rig, pose_problems
-from morgs_mi.fit.features import detect
+from morgs_mi.fit.features import SharedFeatures, detect
 from morgs_mi.loop.first_frame import fit_gaussians
 from morgs_mi.stream_loop import StreamLoop
 from tests.quick import quick
