@@ -34,12 +34,12 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.core.arrays import from_numpy
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import at_rest
-from morgs_mi.core.rig import focus_depths, focus_point, scene_extent
+from morgs_mi.core.rig import Focus, scene_extent
 from morgs_mi.core.types import Tensors
 from morgs_mi.core.view import View, Views
 from morgs_mi.evaluate.comparison import nearest_views
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.fit.far_views import Points
+from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import from_points, mean_color, seed_points
 from morgs_mi.fit.optimise import FINAL_RATE, Steps, adam, optimise, values_of, view_order
@@ -179,11 +179,7 @@ def scores(
 
 def fitted(views: Sequence[View], config: StreamConfig, *points: np.ndarray) -> FittedImages:
     """Return the fit of the first frame to views, from points and their colours or without."""
-    cameras = [view.camera for view in views]
-    masks = [view.mask for view in views]
-    return fit_gaussians(
-        cameras, [view.image for view in views], *points, config=config, masks=masks
-    )
+    return fit_gaussians(views, [view.image for view in views], *points, config=config)
 
 
 def person_alone(people: Sequence[View], weight: float, config: StreamConfig) -> Gaussians:
@@ -222,17 +218,18 @@ def person_alone(people: Sequence[View], weight: float, config: StreamConfig) ->
     return start.with_parameters({**values_of(optimizer), **frozen})
 
 
-def hull_points(people: Sequence[View], rng: np.random.Generator) -> Points:
+def hull_points(people: Sequence[View], rng: np.random.Generator) -> PointCloud:
     """Return random points that all views show in valid pixels, and their mean colours."""
     cameras = [view.camera for view in people]
-    radius = _RADIUS * focus_depths(cameras).mean()
-    points = focus_point(cameras) + radius * rng.uniform(-1, 1, (_CANDIDATES, 3))
+    focus = Focus.of(cameras)
+    radius = _RADIUS * float(np.mean([focus.depth(camera) for camera in cameras]))
+    points = focus.point + radius * rng.uniform(-1, 1, (_CANDIDATES, 3))
     for view in people:
         visible, pixels = seen_pixels(view.camera, points)
         points = points[visible][valid_pixels(view.mask, view.image.shape)[pixels]]
     points = points[:_HULL]
     colors = [unit_values(view.image[seen_pixels(view.camera, points)[1]]) for view in people]
-    return points, np.mean(colors, axis=0)
+    return PointCloud(points, np.mean(colors, axis=0))
 
 
 if __name__ == "__main__":
