@@ -53,7 +53,7 @@ _DENSITY_ROUND = 0.625
 # Distance in px by which lists reach beyond a block: splats move while an epoch shares them.
 _MARGIN = 1.0
 # Number of Gaussians times views whose lists are built at once, at most: it bounds the memory.
-_MOST_SPLATS = 2**20
+_MOST_SPLATS = 2**18
 
 
 @dataclass(frozen=True, eq=False)

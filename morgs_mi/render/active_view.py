@@ -10,7 +10,7 @@ one loop walks them all.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -50,10 +50,16 @@ class StaticSplats:
     def alone(self) -> Splats:
         """The view's splats."""
         with dr.suspend_grad():
-            lane = dr.arange(mi.UInt32, self.count) + opaque(mi.UInt32, self.first)
-            splats = self.together.at(lane)
+            splats = self.of_view(self.together.channels)
             dr.eval(splats)
         return splats
+
+    def of_view(self, channels: Iterable[str], view: int | None = None) -> Splats:
+        """Return the view's splats with some channels, and perhaps the index of the view."""
+        lane = dr.arange(mi.UInt32, self.count) + opaque(mi.UInt32, self.first)
+        blended = {name: self.together.channels[name] for name in channels}
+        splats = replace(self.together, channels=blended).at(lane)
+        return splats if view is None else replace(splats, view=dr.full(mi.UInt32, view, len(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,11 +285,7 @@ class ViewGroup:
     def _static_splats(self, channels: tuple[str, ...]) -> Splats | None:
         """Return the static splats of all views with some channels; None if there are none."""
         parts = [
-            replace(
-                view.static_splats.alone,
-                view=dr.full(mi.UInt32, index, len(view.static_splats)),
-                channels={name: view.static_splats.alone.channels[name] for name in channels},
-            )
+            view.static_splats.of_view(channels, index)
             for index, view in enumerate(self.views)
             if view.static_splats is not None
         ]
