@@ -8,7 +8,6 @@ from typing import Any
 
 from benchmarks.pages.results import committed
 from benchmarks.reports import (
-    cameras,
     codec,
     far_cameras,
     field,
@@ -18,7 +17,6 @@ from benchmarks.reports import (
     renderer,
     stability,
     starts,
-    timing,
 )
 from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import markdown
@@ -194,8 +192,6 @@ def trial_table(table: Callable[..., str]) -> str:
 
 TABLES: Mapping[str, Callable[[], str]] = {
     "accuracy": accuracy,
-    "cameras": partial(study_table, cameras, "cameras"),
-    "clocks": partial(study_table, timing, "timing"),
     "codec": lambda: codec.quality_table(committed("codec_report")["clips"]),
     "demo": demo,
     "far_cameras": partial(study_table, far_cameras, "far_cameras"),

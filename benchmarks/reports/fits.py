@@ -5,14 +5,13 @@ fits.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.reports.study import StudyOptions
 from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.container import Packet, StreamWriter
@@ -21,49 +20,10 @@ from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.extras.synth.synth_config import SynthConfig
 from morgs_mi.extras.synth.synthesize import synthesize
-from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 
 DEFAULT = "default"  # name of the settings without a preset
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClipOptions(StudyOptions):
-    """Base of the options of studies on small clips that are made for them."""
-
-    clips: Path = Path("out/clips")
-    """Folder of the clips, which are made where they are missing."""
-    frames: int = 6
-    """Number of frames."""
-    width: int = 160
-    """Width of the images in pixels; the height is three quarters of it."""
-    gaussians: int | None = 4000
-    """Gaussians of the first frame."""
-    steps: int | None = 600
-    """Steps of the first frame."""
-    epochs: int = 4
-    """Epochs of a later frame."""
-
-    def config(self, **fit: Any) -> StreamConfig:
-        """Return the settings of a fit, with further ones of `FitConfig`."""
-        work = {
-            "num_gaussians": self.gaussians,
-            "first_frame_steps": self.steps,
-            "epochs": self.epochs,
-        }
-        return StreamConfig(FitConfig(**{**work, **fit}))
-
-    def clip(self, scene: str | Path, name: str, **settings: Any) -> Capture:
-        """Return the clip of a scene, with further settings of `SynthConfig`."""
-        config = SynthConfig(frames=self.frames, width=self.width, height=self.width * 3 // 4)
-        config = replace(config, **settings)
-        return synthetic(scene, self.clips / f"{name}-{config.frames}x{self.width}", config)
-
-    def named_clip(self, name: str) -> Capture:
-        """Return the clip of a scene; random-N is the random one of the seed N."""
-        scene, _, seed = name.partition("-")
-        return self.clip(scene, name, seed=int(seed or 0))
 
 
 def synthetic(scene: str | Path, clip: Path, config: SynthConfig, downscale: float = 1) -> Capture:

@@ -29,7 +29,7 @@ from morgs_mi.platform.files import json_finite
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed
 # Options on which no figure depends.
-_PATHS = ("json", "clips", "capture", "captures", "pictures", "silhouettes")
+_PATHS = ("json", "clips", "capture", "silhouettes")
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 from importlib import import_module
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tyro
 
-from benchmarks.reports import cameras, random_scenes, timing
-from benchmarks.reports.study import Scene
+from benchmarks.reports import random_scenes
 from benchmarks.reports.tracks import track_scores
 from morgs_mi import RenderConfig, SynthConfig, load_capture, synthesize
 from morgs_mi.capture.truth import Tracks, save_tracks
@@ -22,24 +20,19 @@ from tests.quick import quick
 from tests.scenes.moving_splats import moved
 
 SEED = "--seeds 1 --clips CLIPS"
-CLIP = "--gaussians 60 --steps 3 --frames 3 --width 48 --epochs 1 --clips CLIPS"
 STREAM = "CLIPS/random-1 --out OUT --stream.fit.first-frame-steps 3 --stream.fit.sh-degree 0"
 FIELD = f"{SEED} --epochs 2 --num-gaussians 60 --first-frame-steps 3 --plot OUT/a.png"
 METHOD = "--presets baseline paper --tuned baseline --epochs 2 --key-views 1 --rates 1 2 --seeds 2"
 OUTLINES = "--capture CLIPS/random-1 --silhouettes CLIPS/outlines.json"
 REPORTS = {
-    "cameras": f"{SEED} --gaussians 60 --steps 3 --degrees 0 0.5 --disturbances 0 --lens 0.1",
     "codec": f"{STREAM} --qualities 1 --plot OUT/a.png",
-    "drift": f"{CLIP} --scenes spheres",
     "far_cameras": f"{OUTLINES} --downscale 1 --gaussians 60 --steps 3 --fit-seeds 0",
     "field": FIELD,
     "held_out": "CLIPS/fit",
     "method": f"{STREAM} --num-gaussians 60 {METHOD}",
     "needed": "--sets random-41 --clips CLIPS --recordings CLIPS --most 4",
     "random_scenes": f"{SEED} --frames 2",
-    "real": "--captures CLIPS/random-1 --gaussians 60 --steps 3 --width 48 --pictures OUT",
     "renderer": "--gaussians 400 --width 48 --height 32 --plot OUT/a.png",
-    "timing": f"{CLIP} --seeds 1 --fitted 2 --fit-seeds 0",
     "tracks": "CLIPS/fit",
 }
 
@@ -50,9 +43,7 @@ def clips(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clips")
     size = SynthConfig(cameras=5, frames=3, width=48, height=36, spp=1)
     clip = synthesize("spheres", folder / "random-1", size)
-    for name in ("random-41", "random-1-one-clock-3x48", "random-1-apart-3x48", "spheres-3x48"):
-        (folder / name).symlink_to(clip)
-    (folder / "random-1-lens-0.1").symlink_to(clip)
+    (folder / "random-41").symlink_to(clip)
     square = [[18, 12], [30, 12], [30, 24], [18, 24]]
     outlines = {f"cam{view:02d}": square for view in range(5)}
     write_json(folder / "outlines.json", {"silhouettes": outlines})
@@ -65,11 +56,6 @@ def clips(tmp_path_factory):
 @pytest.mark.parametrize("name", REPORTS)
 def test_reports__write_rows(name, clips, tmp_path, monkeypatch):
     monkeypatch.setattr(random_scenes, "StreamConfig", lambda fit: quick())
-    # Both need larger images.
-    monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))
-    zeros = {f"cam{view:02d}": 0.0 for view in range(5)}
-    offsets = SimpleNamespace(offsets=zeros, errors=zeros, reference="cam00")
-    monkeypatch.setattr(timing, "estimate_time_offsets", lambda capture: offsets)
     text = REPORTS[name] + (" --json OUT/out.json" if name != "method" else "")
     args = text.replace("CLIPS", str(clips)).replace("OUT", str(tmp_path)).split()
     report = import_module(f"benchmarks.reports.{name}")
