@@ -58,42 +58,7 @@ def against_the_field() -> Figure:
     return figure
 
 
-# Of seconds and of gigabytes.
-_TICKS = (0.5, 1, 2, 4, 8)
-
-
-def growth() -> Figure:
-    """Return the seconds and the memory of a later frame over each size of its problem, and over
-    the frames of a recording.
-    """
-    from matplotlib.ticker import EngFormatter
-
-    result = committed("growth")
-    figure = blank_figure(11, 4.4)
-    columns = figure.subplots(2, len(result["axes"]) + 1, sharey="row").T
-    measures = (("seconds", 1, "s"), ("resident", 1e-9, "GB"))
-    for (axis, entry), column in zip(result["axes"].items(), columns, strict=False):
-        for plot, (name, unit, _) in zip(column, measures, strict=True):
-            points = entry["points"]
-            sizes = [point[axis] for point in points]
-            plot.plot(sizes, [unit * point[name] for point in points], "o-")
-            plot.set(xscale="log", yscale="log")
-            plot.set_xticks(sizes, [EngFormatter(places=0, sep="")(size) for size in sizes])
-            plot.set_title(f"slope {entry['slopes'][name]:.2f}", fontsize=9)
-            plot.minorticks_off()
-        column[1].set_xlabel(axis)
-    frames = range(1, len(result["frames"]) + 1)
-    for plot, (name, unit, label), first in zip(columns[-1], measures, columns[0], strict=True):
-        plot.plot(frames, [unit * frame[name] for frame in result["frames"]])
-        first.set_ylabel(label)
-        first.set_yticks(_TICKS, map(str, _TICKS))
-    columns[-1][0].set_title("one recording", fontsize=9)
-    columns[-1][1].set_xlabel("frame")
-    return figure
-
-
 # Every plot by the name of its file.
 PLOTS: Mapping[str, Callable[[], Figure]] = {
     "against_the_field": against_the_field,
-    "growth": growth,
 }

@@ -14,7 +14,6 @@ from benchmarks.reports import (
     held_out,
     needed,
     random_scenes,
-    renderer,
     stability,
     starts,
 )
@@ -105,32 +104,6 @@ def frame_times() -> str:
     return markdown(("Gaussians", *titles), rows)
 
 
-def splat_files() -> str:
-    """Return the times of the commands for files of Gaussians by number of Gaussians."""
-    rows = (
-        (
-            f"{row['gaussians']:,}",
-            f"{row['file_megabytes']:.0f}",
-            *(
-                f"{row[name]:.1f}"
-                for name in ("open_seconds", "first_image_seconds", "image_seconds", "page_seconds")
-            ),
-            f"{row['page_megabytes']:.0f}",
-        )
-        for row in committed("splat_files")["rows"]
-    )
-    titles = (
-        "Gaussians",
-        "file, MB",
-        "open, s",
-        "first image, s",
-        "image, s",
-        "web page, s",
-        "page, MB",
-    )
-    return markdown(titles, rows, left=0)
-
-
 def fuzz() -> str:
     """Return the number of damaged streams by fuzzer."""
     changes = {
@@ -146,52 +119,12 @@ def fuzz() -> str:
     return markdown(("fuzzer", "what is changed", "streams"), rows, left=2)
 
 
-def accuracy() -> str:
-    """Return time and errors of the cut-offs of the renderer."""
-    return renderer.errors_table(committed("renderer_report")["rows"])
-
-
-def steps() -> str:
-    """Return the time of an optimisation step, and its ratio to hand-written code."""
-    names = {
-        "W1": "20k Gaussians, 512x384",
-        "W2b": "100k Gaussians, 1352x1014",
-        "W2": "the same, splats twice as large",
-    }
-    rows = []
-    for workload, name in names.items():
-        run = committed(f"render_speed_{workload}")
-        volprim = f"{run['volprim_step_ms']:.0f} ms" if "volprim_step_ms" in run else "not run"
-        rows.append((name, f"{run['step_ms']:.0f} ms", f"{run['ratio_to_yardstick']:.2f}", volprim))
-    return markdown(("", "step", "ratio to tuned C++", "`volprim_rf_basic`"), rows)
-
-
-def step_parts() -> str:
-    """Return the share of a step that each of its parts takes."""
-    rows: dict[str, list[str]] = {}
-    for name in ("W1", "W2b"):
-        without = committed("step_parts")[name]["shares"]
-        shares = {
-            "projection and lists": 1 - without["blending"],
-            "blending": without["blending"] - without["adjoint"],
-            "adjoint of both": without["adjoint"],
-            "exponentials, in both loops": without["exponentials"],
-            "sums over pixels, in the adjoint": without["sums"],
-            "loads of Gaussians, in both loops": without["loads"],
-            "outside of the blocks: launches, work per Gaussian": 1 - without["all blocks"],
-        }
-        for part, share in shares.items():
-            rows.setdefault(part, [part]).append(f"{100 * share:.0f} %")
-    return markdown(("", "20k Gaussians, 512x384", "100k Gaussians, 1352x1014"), rows.values())
-
-
 def trial_table(table: Callable[..., str]) -> str:
     """Return a table of the trial of branches."""
     return table(needed.rows_of(committed("what_is_needed")))
 
 
 TABLES: Mapping[str, Callable[[], str]] = {
-    "accuracy": accuracy,
     "codec": lambda: codec.quality_table(committed("codec_report")["clips"]),
     "demo": demo,
     "far_cameras": partial(study_table, far_cameras, "far_cameras"),
@@ -206,10 +139,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "parts": parts,
     "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
-    "splat_files": splat_files,
     "stages": lambda: stages.table(committed("stages")["profiles"]),
-    "step_parts": step_parts,
-    "steps": steps,
     **{
         f"trial_{name}": partial(trial_table, table)
         for name, table in (

@@ -1,6 +1,5 @@
-"""Reports on error and run time of the renderer, the codec and the method.
+"""Reports on errors of the renderer, the codec and the method.
 
-    python -m benchmarks.reports renderer --json out.json
     python -m benchmarks.reports stability --json out.json
     python -m benchmarks.reports codec CAPTURE... --out out/codec
     python -m benchmarks.reports method CAPTURE... --out out/method
@@ -18,12 +17,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.reports import codec, method, renderer, stability
+from benchmarks.reports import codec, method, stability
 from morgs_mi.cli.main import Common, run
 from morgs_mi.cli.settings import one_command
 
 SUBJECTS = {
-    "renderer": renderer.Options,
     "stability": stability.Options,
     "codec": codec.Options,
     "method": method.Options,

@@ -6,24 +6,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import drjit as dr
 import numpy as np
 import pytest
 
-from benchmarks import ewa, pictures, workloads
+from benchmarks import pictures
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
-from benchmarks.speed import (
-    frame_speed,
-    growth,
-    render_speed,
-    splat_files,
-    stages,
-    step_parts,
-)
+from benchmarks.speed import frame_speed, stages
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.stream_loop import StreamLoop
-from tests.scenes.cameras import make_sensor_camera
-from tests.scenes.gaussians import make_unit_scene, to_gaussians
 from tests.scenes.recording import CONFIG, recording
 from tests.scenes.shifted_ball import PLAIN, SHIFT, fit_shifted
 
@@ -61,52 +51,8 @@ def test_host__counts_the_operations_of_a_frame_and_of_a_step(tmp_path):
     assert result.returncode == 0, result.stderr
 
 
-def test_growth__measures_a_tiny_scene():
-    point = growth.measure(frame_speed.Size(64, 48, 3, 600, 2))
-    assert point["pixels"] == 64 * 48
-    assert min(point.values()) > 0
-    assert growth.slope([1, 10], [2, 200]) == pytest.approx(2)
-
-
 @pytest.mark.slow
-def test_render_speed__compares_with_other_programs(tmp_path):
-    program = tmp_path / "yardstick"
-    program.write_text('#!/bin/sh\n[ -s "$1" ] && echo "fwd+bwd ms: median 0.5"')
-    program.chmod(0o755)
-    options = render_speed.Options(workload=tmp_path, yardstick=program, baselines=True)
-    result = render_speed.figures(*workloads.ball(0, 60, 40, 24, 0.1), options)
-    assert result["ratio_to_yardstick"] == pytest.approx(result["step_ms"] / 0.5, rel=1e-2)
-    assert min(result["tenth_share"], result["volprim_step_ms"]) > 0
-
-
-def test_step_parts__change_the_gradients_and_leave_the_renderer_as_it_was():
-    scene = workloads.ball(0, 60, 40, 24, 0.1)
-
-    def gradients(part):
-        # A recording has the loops of its first call; each measurement has its own process.
-        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False), step_parts.without(part):
-            return np.concatenate([np.ravel(g) for g in step_parts.work(*scene, part)()])
-
-    whole = gradients("")
-    for part in ("exponentials", "sums", "loads"):
-        assert np.isfinite(gradients(part)).all()
-        assert np.abs(gradients(part) - whole).max() > 0.01 * np.abs(whole).max()
-        np.testing.assert_array_equal(gradients(""), whole)
-
-
-@pytest.mark.slow
-def test_step_parts__times_the_parts():
-    scene = workloads.ball(0, 60, 40, 24, 0.1)
-    for part in ("adjoint", "blending", "all blocks"):
-        assert render_speed.timed(step_parts.work(*scene, part)) > 0
-
-
-def test_splat_files__reports_times_and_sizes():
-    assert min(splat_files.measure(200, width=64).values()) > 0
-
-
-@pytest.mark.slow
-def test_pictures__are_drawn(tmp_path):
+def test_pictures__are_drawn():
     loop = StreamLoop.of(recording(), CONFIG)
     frames = recording().partial_frames(0, CONFIG.motion.mask_interval + 1)
     *others, last = [frame.images for frame in frames]
@@ -114,5 +60,3 @@ def test_pictures__are_drawn(tmp_path):
         loop.push(images)
     page = (Path(__file__).parents[2] / "docs/how-it-works.md").read_text(encoding="utf-8")
     assert set(pictures.draw(loop, last)) == set(re.findall(r"\(how-it-works/(\w+)\.jpg\)", page))
-    images = ewa.rendered(to_gaussians(make_unit_scene()), make_sensor_camera(), 16)
-    assert ewa.write_picture(tmp_path / "ewa.jpg", images) > 25

@@ -32,7 +32,6 @@ REPORTS = {
     "method": f"{STREAM} --num-gaussians 60 {METHOD}",
     "needed": "--sets random-41 --clips CLIPS --recordings CLIPS --most 4",
     "random_scenes": f"{SEED} --frames 2",
-    "renderer": "--gaussians 400 --width 48 --height 32 --plot OUT/a.png",
     "tracks": "CLIPS/fit",
 }
 

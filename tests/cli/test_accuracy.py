@@ -2,11 +2,11 @@
 
 import pytest
 
-from benchmarks.workloads import ball
 from morgs_mi import write_ply
 from morgs_mi.evaluate import accuracy as module
 from morgs_mi.platform.bounded import read_json
 from tests.cli.commands import assert_refused
+from tests.scenes.gaussians import ball
 
 
 @pytest.fixture

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.workloads import ball
 from morgs_mi import RenderConfig, accuracy
 from morgs_mi.evaluate import accuracy as module
 from morgs_mi.evaluate.accuracy import ATTRIBUTES, Setting, chosen, reference64
 from tests import reference
 from tests.scenes.cameras import make_camera
-from tests.scenes.gaussians import as_float32, isotropic, make_scene, to_gaussians
+from tests.scenes.gaussians import as_float32, ball, isotropic, make_scene, to_gaussians
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from morgs_mi import Gaussians
+from morgs_mi import Camera, Gaussians
 from morgs_mi.core.attributes import BY_NAME, Attribute
+from morgs_mi.core.color_space import SH_C0
 
 Values = dict[str, np.ndarray]
 
@@ -125,3 +126,19 @@ def isotropic(means, scale, opacity, sh_coeffs=0.0, **more):
 def random_sheet(rng, n, extent, z):
     """Return n random points [n, 3] of a square of half size `extent` at depth z."""
     return np.stack([*rng.uniform(-extent, extent, (2, n)), np.full(n, z)], axis=1)
+
+
+def ball(seed, count, width, height, median_scale, sh_degree=0):
+    """Return Gaussians uniform in the unit ball, and a camera at distance 3 that sees 50 degrees
+    horizontally.
+    """
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    radius = np.cbrt(rng.uniform(size=(count, 1)))
+    means = direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius
+    sh = 0.1 * rng.normal(size=(count, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (rng.uniform(size=(count, 3)) - 0.5) / SH_C0
+    scales = median_scale * np.exp(0.4 * rng.normal(size=(count, 3)))
+    quats = rng.normal(size=(count, 4))
+    gaussians = Gaussians.from_activated(means, scales, quats, rng.uniform(0.1, 0.95, count), sh)
+    return gaussians, Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 50.0, width, height)
