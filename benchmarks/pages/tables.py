@@ -8,7 +8,6 @@ from typing import Any
 
 from benchmarks.pages.results import committed
 from benchmarks.reports import (
-    codec,
     far_cameras,
     field,
     held_out,
@@ -17,7 +16,6 @@ from benchmarks.reports import (
     stability,
     starts,
 )
-from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import markdown
 from benchmarks.speed import host, stages
 
@@ -43,48 +41,6 @@ def demo() -> str:
         )
     )
     return markdown(("", "PSNR", "motion error, moving", "still"), rows)
-
-
-def gains() -> str:
-    """Return the gains of the default over the tuned baseline, and over the paper's scheme."""
-    rows = []
-    for clip in committed("method_report")["clips"]:
-        best = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
-        cells = []
-        for epochs in (2, 8):
-            ours, theirs, paper = (
-                best[preset, epochs] for preset in ("default", "baseline", "paper")
-            )
-            cells += [f"{ours[name] - theirs[name]:.2f}" for name in ("psnr", "psnr_moving")]
-            cells.append(f"{ours['psnr_moving'] - paper['psnr_moving']:.2f}")
-        rows.append((f"`{clip['name']}`", *cells))
-    over_paper = "moving, over `paper`"
-    titles = "2 epochs: PSNR, dB", "moving", over_paper, "8 epochs: PSNR, dB", "moving", over_paper
-    return markdown(("clip", *titles), rows)
-
-
-def parts() -> str:
-    """Return the scores of the presets with one part more each, at 2 and 8 epochs."""
-    (clip,) = committed("method_parts")["clips"]
-    best = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
-    rows = []
-    for preset in ("baseline", "paper", "ml", "ml-mo", "ml-mo-mc"):
-        short = best[preset, 2]
-        long = best[preset, 8]
-        psnrs = (
-            f"{scores[name]:.2f}" for scores in (short, long) for name in ("psnr", "psnr_moving")
-        )
-        iou = "-" if long["confidence_iou"] is None else f"{long['confidence_iou']:.2f}"
-        rows.append((f"`{preset}`", *psnrs, f"{long['motion_error_moving']:.2f}", iou))
-    titles = (
-        "2 epochs: PSNR, dB",
-        "moving",
-        "8 epochs: PSNR, dB",
-        "moving",
-        "motion error, px",
-        "IoU",
-    )
-    return markdown(("preset", *titles), rows)
 
 
 def frame_times() -> str:
@@ -125,18 +81,15 @@ def trial_table(table: Callable[..., str]) -> str:
 
 
 TABLES: Mapping[str, Callable[[], str]] = {
-    "codec": lambda: codec.quality_table(committed("codec_report")["clips"]),
     "demo": demo,
     "far_cameras": partial(study_table, far_cameras, "far_cameras"),
     "field": lambda: field.field_table(committed("field")["cells"]),
     "frame_times": frame_times,
     "fuzz": fuzz,
-    "gains": gains,
     "held_out_views": lambda: held_out.first_frames(
         committed("held_out")["fits"], committed("held_out_seeds")["fits"]
     ),
     "host": lambda: host.sizes_table(committed("host")["sizes"]),
-    "parts": parts,
     "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     "stages": lambda: stages.table(committed("stages")["profiles"]),

@@ -139,15 +139,3 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         OSError: the file cannot be written.
     """
     figure.savefig(path, dpi=90)
-
-
-def label_points(
-    axis: Any,
-    points: Iterable[tuple[float, float]],
-    names: Iterable[str],
-    shift: tuple[float, float],
-    size: float = 7,
-) -> None:
-    """Write a name beside each point, offset by `shift` typographic points."""
-    for name, point in zip(names, points, strict=True):
-        axis.annotate(name, point, xytext=shift, textcoords="offset points", fontsize=size)

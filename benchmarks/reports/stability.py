@@ -1,6 +1,6 @@
 """Errors of the renderer in stiff and extreme cases, and fits of hard recordings.
 
-    python -m benchmarks.reports stability
+    python -m benchmarks.reports.stability
 
 writes `benchmarks/results/stability.json` and the plot of the page docs/experiments/stability.md;
 `python -m benchmarks.pages` writes its table.
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import tyro
 
 from benchmarks.reports.plots import blank_figure, grouped, markdown, save_figure
 from benchmarks.reports.study import Row
@@ -169,3 +170,7 @@ def condition_plot(rows: Sequence[Row]) -> Figure:
     axis.set(xlabel="condition number", ylabel="error: image (solid), worst gradient (dashed)")
     axis.grid(alpha=0.3)
     return figure
+
+
+if __name__ == "__main__":
+    tyro.cli(Options).run()

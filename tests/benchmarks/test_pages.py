@@ -12,7 +12,6 @@ from benchmarks.pages.__main__ import PAGES, with_tables
 from benchmarks.pages.plots import PLOTS
 from benchmarks.pages.results import RESULTS, committed
 from benchmarks.pages.tables import TABLES
-from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import grouped, span
 
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
@@ -74,6 +73,11 @@ def test_commands__follow_date_and_commit_and_have_options_that_exist():
             continue
         assert tyro.cli(import_module(name).Options, args=args)
     assert all(find_spec(name) for name in inline if name not in ENDED)
+
+
+def best_rows(clip):
+    """Return the rows of a clip at the best rates."""
+    return [row for row in clip["rows"] if row["best"]]
 
 
 def means(rows, *names):
