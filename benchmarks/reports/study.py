@@ -29,7 +29,7 @@ from morgs_mi.platform.files import json_finite
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed
 # Options on which no figure depends.
-_PATHS = ("json", "clips", "capture", "silhouettes")
+_PATHS = ("json", "clips", "capture", "silhouettes", "plot")
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,13 @@ class StudyOptions(Output):
         """Return the rows as a table in Markdown."""
         raise NotImplementedError
 
-    def run(self) -> None:
-        """Run the study, print its table, and write its rows."""
+    def run(self) -> list[Row]:
+        """Run the study, print its table, write its rows, and return them."""
         mi.set_variant("llvm_ad_rgb")
         rows = self.study().run()
         print(self.table(rows))
         self.write({"settings": self.settings(), "fits": rows}, unprinted=["settings", "fits"])
+        return rows
 
     def settings(self) -> dict[str, Any]:
         """Return the options on which the figures depend."""

@@ -135,7 +135,7 @@ def test_rigid_terms__have_the_neighbours_of_the_previous_frame(name):
 
 @pytest.mark.slow
 def test_rigid_terms__let_neighbours_move_alike():
-    settings = Options().settings("rigidity", FIT.epochs, 0)
+    settings = Options().settings_of("rigidity", FIT.epochs)
     result = fit_shifted(PLAIN, config=replace(settings.fit, sh_degree=0))
     assert motion_error(result) < 0.5 * motion_error(fit_shifted(PLAIN))
     assert result.losses.keys() == {"recon", *LOSSES}
