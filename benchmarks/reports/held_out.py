@@ -22,11 +22,7 @@ from benchmarks.reports.plots import markdown
 from benchmarks.speed.output import Output
 from morgs_mi.platform.bounded import read_json
 
-# Frames of a table over time at equal distances, besides the first residual.
-_ROWS = 3
 _SCORES = ("psnr", "psnr_matched", "psnr_moving", "psnr_still")
-# Decimals, factor and unit of the cells of that table.
-_CELLS = (*[(2, 1, "")] * 4, (0, 100, " %"), (0, 1e-3, ""), (1, 1, ""))
 
 
 @dataclass(frozen=True)
@@ -37,10 +33,9 @@ class Options(Output):
     """Folders of the fits, each with its eval.json."""
 
     def run(self) -> None:
-        """Print the tables, and write the scores."""
+        """Print the table, and write the scores."""
         fits = [scores_of(out) for out in self.outs]
         print(first_frames(fits))
-        print(later_frames(fits))
         self.write({"fits": fits})
 
 
@@ -91,23 +86,6 @@ def first_frames(fits: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]
         rows.append((fit["recording"], *cells, balance, psnrs, *means, spread))
     titles = "training views", "Gaussians", "balanced", "held-out views, dB"
     return markdown(("recording", *titles, "mean", "matched", "three seeds"), rows, left=1)
-
-
-def later_frames(fits: Sequence[dict[str, Any]]) -> str:
-    """Return the scores of some frames of the recordings that have several."""
-    rows = []
-    for fit in (fit for fit in fits if len(fit["frames"]) > 1):
-        last = len(fit["frames"]) - 1
-        for index in sorted({0, 1, *np.linspace(0, last, _ROWS, dtype=int).tolist()}):
-            frame = fit["frames"][index]
-            values = [frame[key] for key in (*_SCORES, "active", "num_bytes", "seconds")]
-            cells = (
-                "" if value is None else f"{factor * value:.{digits}f}{unit}"
-                for value, (digits, factor, unit) in zip(values, _CELLS, strict=True)
-            )
-            rows.append((fit["recording"], f"{index}", *cells))
-    titles = "PSNR, dB", "matched", "moving", "still", "active Gaussians", "kB", "s"
-    return markdown(("recording", "frame", *titles), rows, left=1)
 
 
 if __name__ == "__main__":

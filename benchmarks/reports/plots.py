@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,47 +20,43 @@ class Column(NamedTuple):
 
     Attributes:
         title: head of the column.
-        score: name of the score, or a function of a row.
+        score: name of the score.
         decimals: number of decimals.
         factor: factor on the score.
         spread: whether the standard deviation follows the mean.
     """
 
     title: str
-    score: str | Callable[[Mapping[str, Any]], Any]
+    score: str
     decimals: int = 2
     factor: float = 1
     spread: bool = True
 
     def of(self, rows: Sequence[Mapping[str, Any]]) -> str:
         """Return the figure of some rows."""
-        values = [self.score(row) if callable(self.score) else row[self.score] for row in rows]
-        values = [self.factor * float("nan" if value is None else value) for value in values]
+        values = self.factor * np.array([row[self.score] for row in rows], float)
         if self.spread:
             return plus_minus(values, self.decimals)
-        return figure(float(np.mean(values)), self.decimals)
+        return figure(float(values.mean()), self.decimals)
 
 
 def scores_table(
     rows: Iterable[Mapping[str, Any]],
-    keys: Mapping[str, str | Callable[..., Any]],
+    keys: Mapping[str, str],
     columns: Sequence[Column],
-    left: int = 1,
 ) -> str:
     """Return the scores of a study in Markdown: one line for all rows that have the keys in common.
 
     Args:
         rows: rows of a study.
-        keys: names of the keys by the titles of the first columns, or functions of a row.
+        keys: names of the keys by the titles of the first columns.
         columns: of the scores.
-        left: number of columns that are aligned left.
     """
-    groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        values = (key(row) if callable(key) else row[key] for key in keys.values())
-        groups.setdefault(tuple(map(str, values)), []).append(row)
-    lines = [(*names, *(column.of(group) for column in columns)) for names, group in groups.items()]
-    return markdown((*keys, *(column.title for column in columns)), lines, left)
+    lines = [
+        (*map(str, values), *(column.of(group) for column in columns))
+        for values, group in grouped(rows, *keys.values()).items()
+    ]
+    return markdown((*keys, *(column.title for column in columns)), lines)
 
 
 def means_over(rows: Sequence[Mapping[str, Any]], key: str, **about: Any) -> list[dict[str, Any]]:
@@ -95,15 +91,14 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
 def grouped(
     fits: Iterable[Mapping[str, Any]], *keys: str
 ) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """Return the fits that share the values of `keys`, by these values, with lists as tuples."""
+    """Return the fits that share the values of `keys`, by these values."""
     groups: dict[tuple[Hashable, ...], list[Mapping[str, Any]]] = {}
     for fit in fits:
-        values = (tuple(value) if isinstance(value := fit[key], list) else value for key in keys)
-        groups.setdefault(tuple(values), []).append(fit)
+        groups.setdefault(tuple(fit[key] for key in keys), []).append(fit)
     return groups
 
 
-def plus_minus(values: Sequence[float], digits: int = 2) -> str:
+def plus_minus(values: Sequence[float] | np.ndarray, digits: int = 2) -> str:
     """Return the mean and the standard deviation of some fits, which is 0 for a single one."""
     deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
     return f"{np.mean(values):.{digits}f} ± {deviation:.{digits}f}"

@@ -9,8 +9,7 @@ The cases are shared with the tests (`tests.scenes.extremes`, `tests.scenes.hard
 gradients are compared with a reference in extended precision, a million Gaussians with
 `morgs_mi.evaluate.accuracy`. A row has its `kind` and `name`, the errors of the image and of the
 gradient by attribute, the seconds of an image with its gradients after a warm-up, and the condition
-number, if it is one of a ladder; or the sentence that is raised; or the PSNR of the first and the
-last frame of a fit.
+number, if it is one of a ladder; or the PSNR of the first and the last frame of a fit.
 """
 
 from __future__ import annotations
@@ -27,18 +26,13 @@ import tyro
 from benchmarks.reports.plots import blank_figure, grouped, markdown, save_figure
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
-from morgs_mi import rasterize
 from tests.render.exact import ATTRIBUTES, errors, run
 from tests.scenes.extremes import (
     CASES_BY_KIND,
     DISTANCES,
     NEEDLES,
-    REFUSED,
-    eye,
     million_on_a_pixel,
-    raw_gaussians,
 )
-from tests.scenes.gaussians import CHANNELS
 from tests.scenes.hard_fits import HARD_FITS, fitted
 
 if TYPE_CHECKING:
@@ -61,17 +55,14 @@ class Options(Output):
     """JSON file for the rows."""
     plot: Path | None = PAGES / "stability.png"
     """Plot of the errors over condition numbers, .png or .svg; needs matplotlib."""
-    frames: int = 300
-    """Frames of the fit of a still and noisy scene."""
 
     def run(self) -> None:
         """Measure every case, print the table, and write the figures."""
         rows = list(_case_rows())
-        rows += _refusal_rows()
         start = time.perf_counter()
         row = {"kind": "million on a pixel", **million_on_a_pixel()}
         rows.append({**row, "seconds": time.perf_counter() - start})
-        rows += _fit_rows(self.frames)
+        rows += _fit_rows()
         print(stability_table(rows))
         if self.plot is not None:
             save_figure(condition_plot(rows), self.plot)
@@ -96,20 +87,10 @@ def _case_rows() -> Iterator[Row]:
             yield row
 
 
-def _refusal_rows() -> Iterator[Row]:
-    for name, (change, _) in REFUSED.items():
-        try:
-            rasterize(raw_gaussians(**change), eye(), CHANNELS)
-            sentence = None
-        except ValueError as error:
-            sentence = str(error)
-        yield {"kind": "refused", "name": name, "sentence": sentence}
-
-
-def _fit_rows(num_frames: int) -> Iterator[Row]:
+def _fit_rows() -> Iterator[Row]:
     for fit in HARD_FITS:
         start = time.perf_counter()
-        frames = list(fitted(fit, min(fit.num_frames, num_frames)))
+        frames = list(fitted(fit))
         sentences = [status for *_, status in frames if status != "ok"]
         yield {
             "kind": "fit",

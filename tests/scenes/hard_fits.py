@@ -142,7 +142,7 @@ HARD_FITS = [
 ]
 
 
-def fitted(fit, num_frames=None):
+def fitted(fit):
     """Yield the PSNR of the first view against the truth, the raw attributes and the status of each
     frame.
     """
@@ -156,7 +156,7 @@ def fitted(fit, num_frames=None):
     raw = truth.numpy()
     points = raw["means"] + np.float32(fit.shift)
     loop = StreamLoop(fit.cameras, points, np.full((200, 3), 0.5), fit.config)
-    for frame in range(num_frames or fit.num_frames):
+    for frame in range(fit.num_frames):
         _, report = loop.push(fit.recorded(images, frame))
         color = np.asarray(rasterize(loop.gaussians, fit.cameras[0], ("color",)).color)
         quality = psnr(np.clip(color, 0, 1), images[0])
