@@ -7,14 +7,7 @@ from functools import partial
 from typing import Any
 
 from benchmarks.pages.results import committed
-from benchmarks.reports import (
-    far_cameras,
-    field,
-    held_out,
-    needed,
-    stability,
-    starts,
-)
+from benchmarks.reports import far_cameras, field, held_out, needed, stability, starts
 from benchmarks.reports.plots import markdown
 from benchmarks.speed import host, stages
 
