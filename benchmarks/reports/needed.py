@@ -38,6 +38,7 @@ from benchmarks.reports.plots import markdown, plus_minus
 from benchmarks.reports.study import rounded
 from benchmarks.reports.trial_rule import (
     MEASURES,
+    SEEDS,
     Trial,
     next_fit,
     numbers,
@@ -194,7 +195,7 @@ def run_trial(
     rows = list(read_json(path)["fits"]) if path is not None and path.exists() else []
     others = [] if any_commit else [row for row in rows if row["code"] != code]
     rows = rows if any_commit else [row for row in rows if row["code"] == code]
-    pending = iter(lambda: next_fit(rows, place_groups), None)
+    pending = iter(lambda: next_pair(rows, place_groups, code), None)
     for place, off, seed in islice(pending, most):
         scores = rounded(fit(place, off, seed))
         row = {"set": place, "off": list(off), "seed": seed, "code": code, **scores}
@@ -206,6 +207,23 @@ def run_trial(
             document |= {"date": date.today().isoformat(), "machine": machine()}
             write_json(path, document | {"versions": versions()})
     return rows
+
+
+def next_pair(
+    rows: Sequence[Mapping[str, Any]],
+    place_groups: Mapping[str, Sequence[Sequence[str]]],
+    code: str,
+) -> tuple[str, tuple[str, ...], int] | None:
+    """Return the fit to make next: of `next_fit`, or of the default by the same code before it."""
+    fit = next_fit(rows, place_groups)
+    if fit is None:
+        return None
+    place = fit[0]
+    made = [
+        row["seed"] for row in rows if (row["set"], row["code"], row["off"]) == (place, code, [])
+    ]
+    missing = [seed for seed in SEEDS if seed not in made]
+    return (place, (), missing[0]) if missing else fit
 
 
 def rows_of(document: Mapping[str, Any]) -> list[Mapping[str, Any]]:

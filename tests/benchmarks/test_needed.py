@@ -242,6 +242,14 @@ def test_run_trial__continues_fit_by_fit_and_by_code(tmp_path):
     others = [{**r, "code": "other"} for r in rows]
     write_json(path, {"fits": others})
     assert run_trial(path, GROUPS, fit, any_commit=True) == others
+    # Missing ones are compared with a default of the same code.
+    more = {**GROUPS, "b": [*GROUPS["b"], ["v"]]}
+    made = run_trial(path, more, fit, any_commit=True)[len(others) :]
+    assert [(r["off"], r["seed"]) for r in made[:4]] == [
+        *(([], seed) for seed in SEEDS),
+        (["v"], 0),
+    ]
+    write_json(path, {"fits": others})
     assert run_trial(path, GROUPS, fit, most=1)[0]["code"] == code_hash()
     document = read_json(path)
     assert document["fits"][:-1] == others
