@@ -6,7 +6,6 @@ Names of the files in the folder of a fit, and of a capture's settings.
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 from collections.abc import Generator, Iterable, Mapping
@@ -158,12 +157,8 @@ def write_json(path: FilePath, value: Mapping[str, Any]) -> None:
 
 
 def json_finite(value: Any) -> Any:
-    """Return `value` with None for every float in it that JSON cannot represent."""
-    if isinstance(value, Mapping):
-        return {key: json_finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    """Return `value` as JSON has it, with None for every float in it that JSON cannot represent."""
+    return json.loads(json.dumps(value, default=dict), parse_constant=lambda _: None)
 
 
 def write_error(start: str, error: Exception, target: Path) -> OSError:
