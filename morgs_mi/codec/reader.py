@@ -109,24 +109,9 @@ class StreamReader(FrameSource):
     def states(self, near: int | None = None) -> Iterator[CodedFrame]:
         """Decode the packets and yield the state after each frame; see `FrameSource.states`.
 
-        Near a frame, decoding starts at the last keyframe before it. Where the frame cannot be
-        reached from there, because that keyframe or the index is forged, the states from the start
-        of the stream follow.
+        Near a frame, decoding starts at the last keyframe before it.
         """
-        has_frame = False
-        if near is not None:
-            packets = self.near(near)
-            try:
-                for coded in coded_frames(packets):
-                    if coded.frame > near and not has_frame:
-                        break
-                    has_frame = has_frame or coded.frame == near
-                    yield coded
-            except ValueError:
-                if has_frame:
-                    raise
-        if not has_frame:
-            yield from coded_frames(self)
+        return coded_frames(self if near is None else self.near(near))
 
     def near(self, frame: int) -> Iterator[Packet]:
         """Yield the packets from the last keyframe before `frame` on, or from the first.

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from morgs_mi.codec.container import PAYLOAD, PREAMBLE, Packet, PacketKind, decode_packet
-from morgs_mi.codec.packets import decode, keyframe_packet
-from tests.scenes.coded_clip import CAMERAS, cloud
+from morgs_mi.codec.packets import decode
 from tests.scenes.short_clip import sealed
 
 HOSTILE_TEXT = (
@@ -155,24 +154,6 @@ def with_forged_header(clip, rng):
         text = text.replace(f'"{mark}"', _any(HOSTILE_TEXT, rng))
     packet = sealed(text.encode("latin1"), 0)
     return clip.data[: PREAMBLE.size] + packet + clip.data[clip.pieces[1].stop :]
-
-
-def forged_streams(clip):
-    """Return the stream with another keyframe of frame 3, and with an index that has no keyframe as
-    its second entry.
-
-    Both play from the start as the clip does.
-    """
-    forged = keyframe_packet(cloud(9, 0), 3, CAMERAS).encoded
-    keyframe = clip.pieces[6]
-    at = clip.pieces[-1].start
-    assert (keyframe.kind, keyframe.frame) == (1, 3)
-    entries = [(1, 0, clip.pieces[2].start), (1, 3, clip.pieces[4].start)]
-    index = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
-    return (
-        clip.data[: keyframe.start] + forged + clip.data[keyframe.stop : at],
-        clip.data[:at] + sealed(index + struct.pack("<Q8s", at, b"MORGSIDX"), 3),
-    )
 
 
 def _nodes(value):
