@@ -91,16 +91,6 @@ class ColumnReader:
         return np.where(tokens % 2, size, -size)
 
 
-def column_bits(values: np.ndarray) -> float:
-    """Return an estimate of the bits of a column: the entropy of its tokens plus their remaining
-    bits.
-    """
-    tokens, bits, _ = _tokens(values)
-    counts = np.bincount(tokens)
-    counts = counts[counts > 0]
-    return float(bits.sum() - (counts * np.log2(counts / max(len(tokens), 1))).sum())
-
-
 def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the tokens as int32, the number of remaining bits of each, and those bits."""
     size = np.abs(values.astype(np.int64))

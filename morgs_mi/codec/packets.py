@@ -30,7 +30,7 @@ import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
-from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
+from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter
 from morgs_mi.codec.frame_source import FrameState
 from morgs_mi.codec.quantisation import (
     GROUPS,
@@ -48,7 +48,6 @@ from morgs_mi.codec.quantisation import (
 )
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.types import Arrays
 from morgs_mi.platform.config import config_or_default
 
 # Flags of the geometry of a Gaussian that dies; the first three groups are the bits below, all
@@ -263,26 +262,17 @@ def residual_packet(
     births = len(gaussians) - len(survivors)
     birth_groups = {name: value[len(survivors) :] for name, value in groups.items()}
     birth_grid = new_grid(birth_groups, cameras, config)
-    target = config.target_size
     quantizer_step = round(4 * np.log2(config.birth_precision))
-    if target:
-        # The least quantizer step at which the changes are estimated to take `target` bytes.
+    if config.target_size:
+
         def fits(step: int) -> bool:
-            return sum(map(column_bits, coder.columns(coder.rounded(step)))) / 8 <= target
+            return _code(coder, step, birth_grid).nbytes <= config.target_size
 
         quantizer_step = bisect_left(range(_MAX_QUANTIZER_STEP), True, quantizer_step, key=fits)
-    codes = _codes(coder, quantizer_step, birth_grid)
-    while (
-        target
-        and quantizer_step < _MAX_QUANTIZER_STEP
-        and sum(c.nbytes for c in codes.values()) > target
-    ):
-        quantizer_step += 1
-        codes = _codes(coder, quantizer_step, birth_grid)
     arrays = {
         "parent": previous.digest,
         "head": np.array([births, quantizer_step], np.uint32),
-        **codes,
+        "code": _code(coder, quantizer_step, birth_grid),
     }
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
@@ -418,13 +408,13 @@ def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
     return writer.words()
 
 
-def _codes(coder: Coder, quantizer_step: int, birth_grid: Grid) -> Arrays:
+def _code(coder: Coder, quantizer_step: int, birth_grid: Grid) -> np.ndarray:
     """Return the words of the changes with a quantizer step, and of the births."""
     r = coder.rounded(quantizer_step)
     births = len(birth_grid)
     words = _words(chain(coder.columns(r), _grid_columns(birth_grid) if births else ()))
     total = len(coder.survivors) + births
-    return {"code": _padded(words, births, total, birth_grid.num_integers)}
+    return _padded(words, births, total, birth_grid.num_integers)
 
 
 def _head(packet: Packet, limits: dict[str, int]) -> list[int]:

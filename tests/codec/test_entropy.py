@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
+from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter
 
 RNG = np.random.default_rng(3)
 COLUMNS = {
@@ -44,7 +44,6 @@ def test_column_writer__is_close_to_the_entropy(scale):
     # Learning the distribution costs about ten bits per distinct token, and octaves are modelled as
     # uniform.
     assert entropy < size < 1.035 * entropy + 300
-    assert size == pytest.approx(column_bits(values), rel=0.02, abs=100)
 
 
 def test_column_writer__stores_a_constant_column_in_a_few_bytes():
