@@ -2,9 +2,9 @@
 
 Dr.Jit compiles its CPU kernels with the LLVM that it finds when `drjit` is first imported. It
 refuses version 14 and older; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot
-select: f32 = fminimum``); 17 and newer work. This module needs the standard library only: it can
-run during set-up before anything is installed. ``python -P morgs_mi/platform/llvm.py`` prints the
-library in use, or a sentence with exit status 1.
+select: f32 = fminimum``) and are refused here; 17 and newer work. This module needs the standard
+library only: it can run during set-up before anything is installed. ``python -P
+morgs_mi/platform/llvm.py`` prints the library in use, or a sentence with exit status 1.
 """
 
 from __future__ import annotations
@@ -12,16 +12,12 @@ from __future__ import annotations
 import ctypes
 import os
 import re
-import subprocess
 import sys
-import tempfile
 import warnings
-from contextlib import suppress
 from pathlib import Path
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 SAFE_MAJOR = 17
-DOUBTFUL_MAJOR = 15
 REMEDY = (
     "install one (Debian: apt-get install libllvm19; Ubuntu: the newest of libllvm17 to libllvm20; "
     f"conda: conda install -c conda-forge libllvm19) or set {VARIABLE} to its path"
@@ -29,18 +25,15 @@ REMEDY = (
 # For a path that cannot be opened Dr.Jit raises an exception; with a library that it cannot use it
 # ends the process.
 _NOWHERE = f"/nonexistent/libLLVM-{SAFE_MAJOR}-or-newer.so"
-_NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.so(?:\.(\d+)[\d.]*)?")
-_TRIAL = (
-    "import drjit as dr; from drjit.llvm import Float; dr.eval(dr.minimum(dr.arange(Float, 4), 2))"
-)
+_NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.so(?:\.(\d+)[\d.]*)?(?:git)?")
 
 
-def llvm_major(path: Path) -> int | None:
-    """Return the major version in the name of a file or of a link's target, or None."""
+def llvm_major(path: Path) -> int:
+    """Return the major version in the name of a file or of a link's target, or 0."""
     for name in (path.name, path.resolve().name):
         if (match := _NAME.fullmatch(name)) and (major := match[1] or match[2]):
             return int(major)
-    return None
+    return 0
 
 
 def search_folders() -> list[Path]:
@@ -64,45 +57,14 @@ def find_llvm() -> list[Path]:
     folders = search_folders()
     files = {path.resolve(): path for folder in folders for path in folder.glob("libLLVM*.so*")}
     libraries = [path for path in files.values() if _NAME.fullmatch(path.name)]
-    return sorted(libraries, key=lambda path: llvm_major(path) or 0, reverse=True)
-
-
-def works(path: Path) -> bool:
-    """Return whether Dr.Jit compiles a kernel with this library, tested in a separate process.
-
-    Success is cached per file and machine in ``~/.cache/morgs_mi``; failure is not, because an
-    update of Dr.Jit may change it.
-    """
-    home = os.path.expanduser("~/.cache")  # a temporary folder for a user without a home folder
-    usual = tempfile.gettempdir() if home.startswith("~") else home
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or usual, "morgs_mi", "llvm.txt")
-    key = f"{os.uname().nodename} {sys.executable} {path.resolve()} {path.stat().st_mtime_ns}"
-    with suppress(OSError):
-        if key in cache.read_text().splitlines():
-            return True
-    environment = os.environ | {VARIABLE: str(path)}
-    # -P: not a drjit.py of the current folder.
-    command = [sys.executable, "-P", "-c", _TRIAL]
-    trial = subprocess.run(command, env=environment, capture_output=True)
-    if trial.returncode != 0:
-        return False
-    with suppress(OSError):
-        cache.parent.mkdir(parents=True, exist_ok=True)
-        with cache.open("a") as file:
-            file.write(key + "\n")
-    return True
+    return sorted(libraries, key=llvm_major, reverse=True)
 
 
 def usable(path: Path) -> bool:
-    """Return whether Dr.Jit can use this libLLVM, from its version, or by a test where that is
-    inconclusive.
+    """Return whether the name of a file, or of a link's target, is that of a libLLVM that Dr.Jit
+    can use.
     """
-    if not path.is_file():
-        return False
-    major = llvm_major(path)
-    if major is None or DOUBTFUL_MAJOR <= major < SAFE_MAJOR:
-        return works(path)
-    return major >= SAFE_MAJOR
+    return path.is_file() and llvm_major(path) >= SAFE_MAJOR
 
 
 def choose_llvm(choice: str | None = None) -> tuple[Path | None, str]:
@@ -118,13 +80,15 @@ def choose_llvm(choice: str | None = None) -> tuple[Path | None, str]:
     best = next(filter(usable, libraries), None)
     if choice:
         rest = f"{best} is used instead." if best else f"No other was found: {REMEDY}."
-        return best, f"{VARIABLE}={choice} is not a libLLVM that Dr.Jit can use here. {rest}"
+        return best, (
+            f"{VARIABLE}={choice} is no libLLVM whose name has a version of {SAFE_MAJOR} or newer, "
+            f"such as libLLVM.so.19.1. {rest}"
+        )
     if best:
         return best, ""
-    remark = f" (only {', '.join(map(str, libraries))}, too old for this CPU)" if libraries else ""
+    others = ", ".join(map(str, libraries)) or "none"
     return None, (
-        f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{remark}: "
-        f"{REMEDY}."
+        f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer, found {others}; {REMEDY}."
     )
 
 

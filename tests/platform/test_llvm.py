@@ -28,18 +28,14 @@ def libraries(tmp_path):
     return make
 
 
-@pytest.fixture
-def old_fails(monkeypatch):
-    monkeypatch.setattr(llvm, "works", lambda path: False)
-
-
 @pytest.mark.parametrize(
     ("name", "major"),
     [
         ("libLLVM-14.0.6.so", 14),
         ("libLLVM.so.22.1", 22),
-        ("libLLVM.so", None),
-        ("libLLVMPolly.so", None),
+        ("libLLVM.so", 0),
+        ("libLLVMPolly.so", 0),
+        ("libLLVM.so.21.0git", 21),
     ],
 )
 def test_llvm_major__reads_the_file_name(tmp_path, name, major):
@@ -54,7 +50,6 @@ def test_llvm_major__follows_links(libraries, tmp_path, monkeypatch):
     assert len(llvm.find_llvm()) == 1
 
 
-@pytest.mark.usefixtures("old_fails")
 def test_choose_llvm__takes_the_users_choice_if_it_is_usable_or_else_the_newest(
     libraries, monkeypatch
 ):
@@ -95,12 +90,8 @@ def test_ensure_llvm__raises_without_cuda_and_warns_with_it(monkeypatch):
 
 def test_ensure_llvm__replaces_an_unusable_library_on_import(tmp_path):
     """A library that Dr.Jit cannot use is replaced, with a warning, before Dr.Jit loads it."""
-    bad = next(
-        (p for p in llvm.find_llvm() if (llvm.llvm_major(p) or 99) < 17),
-        tmp_path / "libLLVM-15.so.1",
-    )
-    if llvm.usable(bad):
-        pytest.skip(f"{bad} works on this CPU")
+    bad = tmp_path / "libLLVM-15.so.1"
+    bad.touch()
     code = (
         "import morgs_mi; import drjit as dr; from drjit.llvm import Float; "
         "print(dr.minimum(Float(1, 3), 2))"
