@@ -35,8 +35,9 @@ def atomic_path(path: FilePath, place: str, parents: bool = False) -> Generator[
     """Yield a path in the same folder for a file or folder, which is renamed to `path` when the
     body succeeds.
 
-    On failure what was written is removed and `path` stays as it was. A file replaces a file; a
-    folder replaces one that existed from the start. Missing `parents` are created where asked for.
+    On failure what was written is removed and `path` stays as it was; a process that is killed
+    leaves it beside `path`, as ``.partial-PROCESS-NAME``. A file replaces a file; a folder replaces
+    one that existed from the start. Missing `parents` are created where asked for.
 
     Raises:
         FileExistsError: `path` is a device or a pipe.
@@ -45,19 +46,14 @@ def atomic_path(path: FilePath, place: str, parents: bool = False) -> Generator[
     """
     # A rename would replace a link, except one to itself, and `.` has no name.
     final = Path(os.path.realpath(path))
-    partial = _hidden(final, "partial", os.getpid())
-    old = _hidden(final, "old", os.getpid())
+    partial = final.with_name(f".partial-{os.getpid()}-{final.name}")
+    old = final.with_name(f".old-{os.getpid()}-{final.name}")
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
     if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
         raise FileExistsError(
             f"{place}: {path} is a device or a pipe, which would be replaced; name a file."
         )
-    # Partial files of killed processes, one of which may have had this process's number.
-    for leftover in final.parent.glob(".partial-*-*"):
-        number = leftover.name.split("-")[1]
-        is_partial = number.isdecimal() and leftover == _hidden(final, "partial", number)
-        if is_partial and (int(number) == os.getpid() or not _alive(int(number))):
-            _remove(leftover)
+    _remove(partial)  # of a killed process that had this process's number
     try:
         if parents:
             final.parent.mkdir(parents=True, exist_ok=True)
@@ -66,18 +62,12 @@ def atomic_path(path: FilePath, place: str, parents: bool = False) -> Generator[
             final.rename(old)  # deleting takes time, and a half-deleted folder would look complete
         partial.replace(final)
     except OSError as error:
-        remark = ", the partial output was removed" if os.path.lexists(partial) else ""
-        raise write_error(f"{place}: cannot write {path}{remark}", error, partial) from error
+        raise write_error(f"{place}: cannot write {path}", error, partial) from error
     finally:
         if os.path.exists(old) and not os.path.exists(final):
             old.rename(final)
         _remove(partial)
         _remove(old)
-
-
-def _hidden(path: Path, use: str, process: object) -> Path:
-    """Return a hidden path of a process beside another one."""
-    return path.with_name(f".{use}-{process}-{path.name}")
 
 
 @contextmanager
@@ -129,8 +119,7 @@ def locked_folder(path: FilePath, place: str) -> Generator[None, None, None]:
         except OSError as error:
             if error.errno not in (ENOLCK, ENOTSUP):
                 raise write_error(f"{place}: cannot write into {path}", error, folder) from error
-        status = file.stat()
-        undo.callback(lambda: is_same_file(file, status) and _remove(file))
+        undo.callback(_remove, file)
         yield
 
 
@@ -178,18 +167,6 @@ def _remove_empty(folders: Iterable[Path]) -> None:
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
-
-
-def _alive(process: int) -> bool:
-    if os.name == "nt":  # signal 0 would interrupt this process there
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # it belongs to another user
-        pass
-    return True
 
 
 def _remove(path: Path) -> None:

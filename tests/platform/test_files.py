@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -61,7 +60,7 @@ def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path, kind, ol
             write(partial, kind)
             raise error
 
-    message = r"^test\(\): cannot write .*/x, .*: No space left; check .* disk has room\.$"
+    message = r"^test\(\): cannot write .*/x: No space left; check .* disk has room\.$"
     with pytest.raises(type(error), match=message if isinstance(error, OSError) else str(error)):
         fail()
     assert tree(tmp_path) == old_tree
@@ -70,7 +69,7 @@ def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path, kind, ol
 def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path):
     write_json(tmp_path / "x.json", {"a": 1})
     old_tree = tree(tmp_path)
-    with files_end_at(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
+    with files_end_at(100), pytest.raises(OSError, match=r"x\.json: File too large; check"):
         write_json(tmp_path / "x.json", {"a": "b" * 1000})
     assert tree(tmp_path) == old_tree
 
@@ -83,9 +82,8 @@ def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path, case):
     elif case == "a folder":
         (folder / "x").mkdir(parents=True)
     old_tree = tree(tmp_path)
-    removed = ", the partial output was removed" if case == "a folder" else ""
     with (
-        pytest.raises(OSError, match=rf"test\(\): cannot write {folder}/x{removed}: "),
+        pytest.raises(OSError, match=rf"test\(\): cannot write {folder}/x: "),
         atomic_path(folder / "x", "test()") as partial,
     ):
         partial.write_text("new")
@@ -115,12 +113,9 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(tmp_path, monk
     assert tree(tmp_path) == old_tree
 
 
-def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path):
-    """Partial output of another name, or of a running process, may still be written and stays."""
-    gone = subprocess.Popen(["true"])
-    gone.wait()
-    for number in (os.getpid(), gone.pid):
-        write(tmp_path / f".partial-{number}-x", "folder", "half")
+def test_atomic_folder__removes_partial_output_of_a_killed_process_of_its_number(tmp_path):
+    """Another process may still write its own."""
+    write(tmp_path / f".partial-{os.getpid()}-x", "folder", "half")
     others = {f".partial-{os.getppid()}-x": b"", f".partial-{os.getpid()}-y-x": b""}
     for name in others:
         (tmp_path / name).touch()
@@ -145,7 +140,7 @@ def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(tmp
         atomic_folder(tmp_path / "x", "test()"),
     ):
         pass
-    with pytest.raises(OSError, match=r"y, .*not empty"), atomic_folder(tmp_path / "y", "test()"):
+    with pytest.raises(OSError, match=r"y: .*not empty"), atomic_folder(tmp_path / "y", "test()"):
         write(tmp_path / "y", "folder", "theirs")
     assert tree(tmp_path) == {"x": None, "x/a": b"old", "y": None, "y/a": b"theirs"}
 
@@ -190,14 +185,10 @@ def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path):
     assert not tree(tmp_path)
 
 
-def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path):
+def test_locked_folder__leaves_no_empty_folder(tmp_path):
     with locked_folder(tmp_path / "new" / "out", "test()"):
         pass
     assert not tree(tmp_path)
-    with locked_folder(tmp_path / "out", "test()"):
-        (tmp_path / "out").rename(tmp_path / "moved")
-        with locked_folder(tmp_path / "out", "test()"):
-            pass
 
 
 @pytest.mark.parametrize(
