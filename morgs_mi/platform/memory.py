@@ -10,11 +10,6 @@ import drjit as dr
 
 from morgs_mi.platform.checks import require
 
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
-
 # Growth of the resident memory after which releasing it pays: the next frame allocates its buffers
 # again.
 _GROWTH = 1.1
@@ -47,23 +42,15 @@ def check_memory(place: str, needed: float, content: str, remedy: str) -> None:
 
 
 def free_memory() -> float:
-    """Return the bytes that this process may still use, by the machine, its control group and its
-    own limit.
-    """
+    """Return the bytes that this process may still use, by the machine and its control group."""
     free = [float("inf")]
     for line in _lines("/proc/meminfo"):
         if line.startswith("MemAvailable:"):
             free.append(1024.0 * int(line.split()[1]))
-    limit = "".join(_lines("/sys/fs/cgroup/memory.max")).strip()
-    usage = "".join(_lines("/sys/fs/cgroup/memory.current")).strip()
-    if limit.isdigit() and usage.isdigit():
+    (limit,) = _lines("/sys/fs/cgroup/memory.max") or ["max"]
+    if limit != "max":
+        (usage,) = _lines("/sys/fs/cgroup/memory.current")
         free.append(float(limit) - float(usage))
-    # The address space, which `ulimit -v` limits.
-    sizes = "".join(_lines("/proc/self/statm")).split()
-    if resource is not None and sizes:
-        most = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if most != resource.RLIM_INFINITY:
-            free.append(float(most - int(sizes[0]) * resource.getpagesize()))
     return min(free)
 
 
