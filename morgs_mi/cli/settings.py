@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import reduce
 from operator import or_
@@ -13,13 +12,12 @@ from typing import (
     Any,
     Literal,
     TypeVar,
+    cast,
     dataclass_transform,
-    get_args,
     get_type_hints,
 )
 
 from tyro.conf import FlagCreatePairsOff, arg, subcommand
-from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
@@ -48,8 +46,6 @@ Options = TypeVar("Options")
 _OPTIONS: list[Any] = []
 # A channel that commands render.
 ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
-# Whether something is estimated.
-Estimation = Literal["off", "auto", "on"]
 # A switch that is off by default.
 Flag = Annotated[bool, FlagCreatePairsOff]
 # Names of cameras, none by default.
@@ -124,54 +120,15 @@ def one_command(commands: Mapping[str, type]) -> Any:
     return arg(name="", constructor=union)
 
 
-def _offsets(words: list[str]) -> dict[str, float]:
-    """Return the offset of each camera from the words of --offset, a camera and a number in turn.
-
-    Raises:
-        ValueError: a word is missing, is no number, or names a camera a second time.
-    """
-    offsets: dict[str, float] = {}
-    with suppress(ValueError):
-        pairs = zip(words[::2], words[1::2], strict=True)
-        offsets = {name: float(number) for name, number in pairs}
-    if not words or 2 * len(offsets) != len(words):
-        raise ValueError(
-            "expected each camera once, with a number of frames, such as cam01 -0.5, got "
-            f"{' '.join(words) or 'nothing'}."
-        )
-    return offsets
-
-
-_OFFSETS = PrimitiveConstructorSpec(
-    nargs="*",
-    metavar="CAMERA FLOAT ...",
-    instance_from_str=_offsets,
-    is_instance=lambda value: isinstance(value, dict),
-    str_from_instance=lambda value: [word for pair in value.items() for word in map(str, pair)],
-)
-
-
-def one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
-    """Return how an option that may be missing is read, so that messages list these names, without
-    None, in order.
-    """
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NAME",
-        instance_from_str=lambda words: words[0],
-        is_instance=lambda value: value is None or value in names,
-        str_from_instance=lambda value: [str(value)],
-        choices=names,
-    )
-
-
 @options
 class Reading:
     """Options for differences between the clips of a capture: the fields of `ReadConfig`."""
 
     trim: Flag = False
     """Use the timestamps that all clips contain, at their lowest frame rate."""
-    offset: Annotated[dict[str, float], _OFFSETS] = field(default_factory=dict)
+    offset: Annotated[dict[str, float], arg(metavar="CAMERA FLOAT ...")] = field(
+        default_factory=dict
+    )
     """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it
     began later.
     """
@@ -192,13 +149,9 @@ class Reading:
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    refine_cameras: Annotated[
-        Estimation | None, setting("refine_cameras", metavar="MODE"), one_of(get_args(Estimation))
-    ] = None
+    refine_cameras: Annotated[str | None, setting("refine_cameras", metavar="MODE")] = None
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
-    exposure: Annotated[
-        Estimation | None, setting("exposure", metavar="MODE"), one_of(get_args(Estimation))
-    ] = None
+    exposure: Annotated[str | None, setting("exposure", metavar="MODE")] = None
     """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld
     pixels gain).
     """
@@ -224,7 +177,7 @@ class Settings:
     """Precision of the stream; 2 halves all errors."""
     target_size: Annotated[int | None, setting("target_size")] = None
     """Most bytes of a later frame; 0: no limit."""
-    preset: Annotated[PresetName | None, optional("NAME"), one_of(get_args(PresetName))] = None
+    preset: Annotated[str | None, optional("NAME")] = None
     """Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, or ml,
     ml-mo, ml-mo-mc (its ablation).
     """
@@ -248,7 +201,7 @@ class Settings:
         """
         config = base or StreamConfig()
         if self.preset is not None:
-            config = apply_preset(config, self.preset)
+            config = apply_preset(config, cast(PresetName, self.preset))
         if self.config is not None:
             config = apply_values(config, read_config(self.config), self.config)
         for key, value in self.given().items():

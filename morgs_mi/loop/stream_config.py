@@ -80,6 +80,6 @@ def apply_preset(config: StreamConfig, name: PresetName) -> StreamConfig:
     """
     if name not in PRESETS:
         raise ValueError(
-            f"apply_preset(): `name` must be one of {', '.join(PRESETS)}, got {name!r}."
+            f"apply_preset(): the preset must be one of {', '.join(PRESETS)}, got {name!r}."
         )
     return apply_values(config, PRESETS[name], "apply_preset()")
