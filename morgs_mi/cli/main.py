@@ -17,7 +17,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
-from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import version
 from io import StringIO, TextIOWrapper
@@ -37,7 +36,7 @@ from morgs_mi.cli.console import (
     sentence_of,
 )
 from morgs_mi.cli.evaluate import Eval
-from morgs_mi.cli.export import EXPORTS, Export
+from morgs_mi.cli.export import Export
 from morgs_mi.cli.fit import Fit
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import (
@@ -140,8 +139,8 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
                 tyro.conf.PositionalMetavarFromFieldName,
             ),
         )
-        if options_type is Options and (mistake := _mistake(args)):
-            print_warning(f"{prog}: {mistake}")
+        if options_type is Options and (sentence := _old_option(args)):
+            print_warning(f"{prog}: {sentence}")
             return _REJECTED
         options: Any = _help(parse, args) if {"-h", "--help"} & {*args} else parse()
         _set_up(options)
@@ -162,25 +161,13 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         return INTERRUPTED if is_interruption(error) else 1
 
 
-def _mistake(args: Sequence[str]) -> str:
-    """Return a sentence on an option that went, or on a command that does not exist; empty if the
-    arguments have neither.
-    """
+def _old_option(args: Sequence[str]) -> str:
+    """Return a sentence on the first option that went; empty if there is none."""
     for word in args:
         option = word.partition("=")[0].replace("_", "-")
         if option in OLD_OPTIONS:
             return f"{option} {OLD_OPTIONS[option]}."
-    names = COMMANDS
-    words = args
-    if args[:1] == ["export"]:
-        names = EXPORTS
-        words = args[1:]
-    word = next(iter(words), "-")
-    if word.startswith("-") or word in names:
-        return ""
-    similar = get_close_matches(word, names, 1)
-    question = f"did you mean {similar[0]}?" if similar else "see morgs-mi --help."
-    return f"expected one of {', '.join(names)}, got {word}; {question}"
+    return ""
 
 
 def _help(parse: Callable[[], Any], args: Sequence[str]) -> Any:

@@ -44,9 +44,6 @@ def test_main__writes_the_completion_of_a_shell(tmp_path):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["rendr", "a.ply"], ("morgs-mi: expected one of fit, render, ", "did you mean render?")),
-        (["frobnicate"], ("got frobnicate; see morgs-mi --help.",)),
-        (["export", "gltff"], ("expected one of ply, video, web, gltf, usd", "did you mean gltf?")),
         (["fit", "a", "b", "--test-view", "0"], ("--test-view is now --hold-out.",)),
         (["info", "a", "--without=cam0"], ("--without is now --exclude.",)),
         (["fit", "a", "b", "--segments", "2"], ("--segments is now --chunks.",)),
@@ -57,10 +54,22 @@ def test_main__writes_the_completion_of_a_shell(tmp_path):
         (["fit", "a", "b", "--key_views", "4"], ("`key_views` in `[motion]`",)),
     ],
 )
-def test_main__names_the_command_or_option_that_was_meant(words, parts, run):
+def test_main__names_what_replaces_an_option_that_went(words, parts, run):
     status, output, error = run(*words)
     assert (status, output) == (2, "")
     assert_one_sentence(error, *parts)
+
+
+@pytest.mark.parametrize(
+    ("words", "names"), [(["rendr", "a.ply"], COMMANDS), (["export", "gltff", "a"], EXPORTS)]
+)
+def test_main__lists_the_commands_where_one_is_unknown(words, names, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    captured = capsys.readouterr()
+    text = " ".join((captured.out + captured.err).replace("│", " ").split())
+    assert words[-2] in text
+    assert f"Available subcommands: {', '.join(names)}" in text
 
 
 def test_old_options__are_options_of_no_command(capsys):
