@@ -99,18 +99,18 @@ class Render:
         stem = Path(self.path or "orbit").stem if self.camera is None else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, stem)
         single = chosen.folder and chosen.is_file(output)
-        channels = self.channels or (None if chosen.name == "exr" else ("color",))
+        channels = shown = self.channels
         is_transparent = self.background == "transparent"
         if is_transparent:
-            if chosen.name != "png" or channels != ("color",):
+            if chosen.name != "png" or shown not in (None, ("color",)):
                 raise ValueError(
                     "--background transparent is for the colour in PNG files, got another output."
                 )
-            channels = ("color", "alpha")
+            shown = ("color", "alpha")
+        if chosen.name != "exr":
+            shown = shown or ("color",)
+            channels = tuple(dict.fromkeys((*shown, "color")))  # motion is over the grey colour
         on_background(stream, "black" if is_transparent else self.background)
-        shown = channels
-        if channels and chosen.name != "exr" and "motion" in channels:  # over the grey colour
-            channels = tuple(dict.fromkeys((*channels, "color")))
         images, count = self.images(stream, view, channels, single)
         if single and count > 1:
             raise ValueError(
