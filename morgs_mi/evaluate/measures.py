@@ -78,20 +78,20 @@ class Motion3D:
             self._tracks = load_tracks(self._truth)
         self._last_state: FrameState | None = None
 
-    def scores(self, frame: ComparedFrame) -> Motion3DScores | None:
-        """Return the scores of the next frame; None without tracks or a previous frame."""
+    def scores(self, frame: ComparedFrame) -> Motion3DScores:
+        """Return the scores of the next frame; NaN without tracks or a previous frame."""
         last_state = self._last_state
         state = frame.state
         self._last_state = state
         tracks = self._tracks
         if (
             frame.kind != PacketKind.RESIDUAL
-            or last_state is None
             or tracks is None
-            or self._truth is None
             or state.frame >= tracks.points.shape[1]
         ):
-            return None
+            return Motion3DScores()
+        assert last_state is not None
+        assert self._truth is not None
         views = []
         for camera in self._cameras:
             truth = load_truth(self._truth, camera.name, state.frame - 1)

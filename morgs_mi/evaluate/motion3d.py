@@ -67,7 +67,7 @@ def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
     is 0.
     """
     if not len(truth):
-        return Motion3DScores()
+        return Motion3DScores(num_gaussians=0)
     length = np.linalg.norm(motion, axis=-1)
     true_length = np.linalg.norm(truth, axis=-1)
     error = np.linalg.norm(motion - truth, axis=-1)

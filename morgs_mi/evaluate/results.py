@@ -74,7 +74,8 @@ class ViewScores(_Scores):
 class Motion3DScores(_Scores):
     """Error of the 3D displacements of Gaussians on moving objects (see `motion3d`)."""
 
-    num_gaussians: float = 0  #: Number of Gaussians that are compared.
+    #: Number of Gaussians that are compared; NaN without tracks or a previous frame.
+    num_gaussians: float = _NAN
     error: float = _NAN  #: Mean of |d - d*|, world units.
     true_length: float = _NAN  #: Mean of |d*|, world units.
     relative_error: float = _NAN  #: `error` divided by `true_length`.
@@ -101,7 +102,7 @@ class FrameScores:
     num_bytes: int  #: Size of its packet.
     seconds: float | None  #: Wall time of its fit; None without a report of the fit.
     scores: ViewScores  #: Means over the views.
-    motion_3d: Motion3DScores | None  #: Errors in 3D; None without tracks or a previous frame.
+    motion_3d: Motion3DScores  #: Errors in 3D.
     views: Mapping[str, ViewScores]  #: Scores by camera name.
     #: Whether it was fitted with an image and an evaluated view has one.
     has_images: bool = True
@@ -111,7 +112,7 @@ class FrameScores:
         row = asdict(self)
         del row["has_images"]  # the clip's row names such frames
         scores, motion, views = map(row.pop, ("scores", "motion_3d", "views"))
-        return {**row, **scores, "motion_3d": motion or {}, "views": views}
+        return {**row, **scores, "motion_3d": motion, "views": views}
 
 
 @dataclass(frozen=True)
@@ -183,10 +184,9 @@ class Evaluation:
         }
 
     @property
-    def motion_3d(self) -> Motion3DScores | None:
-        """Mean over the frames; None if no frame has any."""
-        scores = [frame.motion_3d for frame in self.frames if frame.motion_3d is not None]
-        return Motion3DScores.mean(scores) if scores else None
+    def motion_3d(self) -> Motion3DScores:
+        """Mean over the frames."""
+        return Motion3DScores.mean([frame.motion_3d for frame in self.frames])
 
     @property
     def seconds(self) -> Timings:
@@ -207,7 +207,7 @@ class Evaluation:
             **{name: getattr(self, name) for name in names},
             **means,
             "psnr_slope": self.psnr_slope,
-            "motion_3d": {} if self.motion_3d is None else asdict(self.motion_3d),
+            "motion_3d": asdict(self.motion_3d),
             "seconds": {**asdict(self.seconds), "definition": _SECONDS},
             "bytes": asdict(self.sizes),
             "mtv": asdict(self.variation),

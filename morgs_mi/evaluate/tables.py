@@ -90,7 +90,7 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
             "fit best."
         )
     motion = result.motion_3d
-    if motion is not None and motion.num_gaussians:
+    if motion.num_gaussians > 0:
         yield (
             f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error "
             f"{motion.error:.4f} of {motion.true_length:.4f} units "

@@ -206,8 +206,7 @@ def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitt
     assert result.regions == "recorded change"
     assert result.scores.psnr_moving == result.scores.psnr_still == np.inf
     assert np.isnan(result.frames[0].scores.delta_e_moving), "no frame before it"
-    assert result.motion_3d is None
-    assert result.as_dict()["motion_3d"] == {}
+    assert np.isnan(result.motion_3d.num_gaussians)
     assert np.isnan(result.scores.confidence_iou)
 
 
