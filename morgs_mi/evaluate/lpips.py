@@ -30,7 +30,7 @@ class Lpips:
     """Perceptual distance: 0 for equal images, larger for larger differences.
 
     The network has two inputs, ``in0`` and ``in1``, RGB [1, 3, H, W] from -1 to 1, and one output:
-    a distance per pixel [1, 1, H, W] (``spatial=True``), or a single number without regions.
+    a distance per pixel [1, 1, H, W] (``spatial=True``).
 
     Args:
         path: ONNX file.
@@ -54,8 +54,7 @@ class Lpips:
         )
 
     def distance_map(self, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        """Return the distance per pixel [H, W], or of the whole image [1, 1] if the network returns
-        a single number.
+        """Return the distance per pixel [H, W].
 
         Args:
             image: display-referred RGB [H, W, 3], float in [0, 1] or uint8.
@@ -70,13 +69,13 @@ class Lpips:
         inputs = {"in0": _network_input(image), "in1": _network_input(truth)}
         distance = next(iter(self._network.run(inputs).values()))
         require(
-            distance.size in (1, H * W),
+            distance.size == H * W,
             self.path,
-            f"expected one distance, or one for each of {W}x{H} pixels",
+            f"expected a distance for each of {W}x{H} pixels",
             list(distance.shape),
             _ADVICE,
         )
-        return distance.reshape((H, W) if distance.size > 1 else (1, 1))
+        return distance.reshape(H, W)
 
 
 def _network_input(image: np.ndarray) -> np.ndarray:

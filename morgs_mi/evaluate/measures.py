@@ -126,9 +126,7 @@ def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
     if min(a.shape[:2]) >= WINDOW:
         scores |= _by_region("ssim", ssim_map(a, b), regions)
     if lpips is not None:
-        distance = lpips.distance_map(rendered, view.recorded)
-        of_image = distance.shape != a.shape[:2]
-        scores |= {"lpips": distance.item()} if of_image else _by_region("lpips", distance, regions)
+        scores |= _by_region("lpips", lpips.distance_map(rendered, view.recorded), regions)
     return scores
 
 

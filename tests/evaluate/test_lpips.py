@@ -23,17 +23,17 @@ def test_lpips__spatial_network_gives_a_map(tmp_path):
     assert_allclose(net.distance_map(image, truth), expected)
 
 
-def test_lpips__other_network_gives_one_number(tmp_path):
-    net = Lpips(squared_difference(tmp_path / "net.onnx", H, W, spatial=False))
-    assert_close(net.distance_map(IMAGE, TRUTH), [[EXPECTED.mean()]], atol=1e-6)
-    assert net.distance_map(IMAGE, IMAGE) == 0
-
-
 def test_lpips__refuses_unsuitable_networks(tmp_path):
     with pytest.raises(
         ValueError, match="inputs in0 and in1, got left, right; export the network as"
     ):
         Lpips(squared_difference(tmp_path / "other.onnx", H, W, inputs=("left", "right")))
+    single = Lpips(squared_difference(tmp_path / "net.onnx", H, W, spatial=False))
+    with pytest.raises(
+        ValueError,
+        match=r"expected a distance for each of 17x12 pixels, got \[1, 1, 1, 1\]; export the",
+    ):
+        single.distance_map(IMAGE, TRUTH)
 
 
 @pytest.mark.parametrize(
