@@ -10,6 +10,7 @@ from rich.table import Table
 
 from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.results import Evaluation, ViewScores
+from morgs_mi.platform.checks import few
 
 # Title, name of the score and decimals. Some scores are of the whole image alone.
 _METRICS = (
@@ -46,8 +47,6 @@ def figure(value: float | None, digits: int) -> str:
 def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     """Yield tables of the frames, of several views and of the regions."""
     kind = "held-out" if result.held_out else "training"
-    names = ", ".join(result.views)
-    evaluated = f"{kind} views" if len(result.views) > 1 else f"{kind} view {names}"
     table = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result.frames:
         costs = (figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1))
@@ -56,12 +55,13 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     if len(result.views) > 1:
         # A score that the mean of all views lacks, no view has.
         columns = [row for row in _VIEW if not np.isnan(getattr(result.scores, row[1]))]
-        title = f"{evaluated}, means over the frames"
+        title = f"{kind} views, means over the frames"
         table = _table(title, "", *(title for title, *_ in columns))
         for name, scores in {**result.views, "mean": result.scores}.items():
             table.add_row(name, *_cells(scores, columns))
         yield table
-    title = f"{evaluated}: means, regions from {result.regions}"
+    names = few(list(result.views), 2)
+    title = f"{kind}: {names}; means, regions from {result.regions}"
     table = _table(title, "", "whole", "moving", "still")
     mean = result.scores
     for title, name, digits in _METRICS:
@@ -84,7 +84,7 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
     )
     if result.held_out:
         yield (
-            f"Held-out {'views' if len(result.views) > 1 else 'view'} in all frames: "
+            "Held-out in all frames: "
             f"{figure(result.scores.psnr, 2)} dB as recorded, "
             f"{figure(result.scores.psnr_matched, 2)} dB after the gain and bias per channel that "
             "fit best."
