@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.codec.container import TruncatedStreamError, decode_packet
+from morgs_mi.codec.container import decode_packet
 from morgs_mi.codec.packets import reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.extras.cluster.tasks import (
@@ -37,7 +37,7 @@ from morgs_mi.extras.cluster.workers import installed, num_workers
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.platform.checks import quantity
-from morgs_mi.platform.files import REPORT, STREAM, locked_folder
+from morgs_mi.platform.files import locked_folder
 from morgs_mi.platform.interrupts import interrupts_raised
 from morgs_mi.platform.progress import Progress, Report
 from morgs_mi.playback.stream_header import about_lenses, as_fitted
@@ -47,9 +47,7 @@ from morgs_mi.runs.fit_files import (
     Interrupted,
     Recording,
     check_outputs,
-    check_same_fit,
     interrupted_fit,
-    read_reports,
     stream_metadata,
 )
 
@@ -61,6 +59,7 @@ FOLDER = "chunks"
 # finely.
 TASK_FRAMES = 10
 _MIN_FRAMES = 2  # of a chunk
+_ONE_CHUNK = ChunkConfig()
 _LOG = logging.getLogger(__name__)
 
 
@@ -96,7 +95,7 @@ class ChunkedRun:
         out: folder, made if missing.
         client: from `open_client`.
         config: settings.
-        chunks: their number and the settings of the boundaries; None: one chunk.
+        chunks: their number and the settings of the boundaries.
         on_stage: called with (name of the stage, done, total).
 
     Example:
@@ -113,14 +112,13 @@ class ChunkedRun:
         out: str | Path,
         client: Client,
         config: StreamConfig,
-        chunks: ChunkConfig | None = None,
+        chunks: ChunkConfig = _ONE_CHUNK,
         on_stage: Report | None = None,
     ) -> None:
-        chunks = chunks or ChunkConfig()
         self.capture = capture
         self.out = Path(out)
         self.client = client
-        self.on_stage: Report = on_stage or (lambda *_: None)
+        self.progress = Progress(on_stage)
         num_frames = capture.num_frames
         most = max(1, num_frames // _MIN_FRAMES)
         if not 1 <= chunks.count <= most:
@@ -157,13 +155,15 @@ class ChunkedRun:
         check_outputs(self.out)
         with locked_folder(self.out, "ChunkedRun.fit()"):
             folder = self.out / FOLDER
-            if resume and not folder.exists() and (reports := self._complete()):
-                return reports
+            if resume and not folder.exists():
+                earlier = interrupted_fit(FitFiles.of(self.out), self.capture, self.metadata)
+                if earlier is not None and len(earlier.reports) == self.capture.num_frames:
+                    return earlier.reports
             if not resume:
                 _remove(folder)
             folder.mkdir(exist_ok=True)
             with ExitStack() as self.open_files:
-                self._fit_side_by_side(self._begun(Progress(self.on_stage)))
+                self._fit_side_by_side(self._begun())
             packets = (
                 packet
                 for start in self.starts[:-1]
@@ -171,13 +171,12 @@ class ChunkedRun:
             )
             recordings = [self.recordings[start] for start in self.starts[:-1]]
             reports = [report for recording in recordings for report in recording.reports]
-            workers = {"workers": self.peaks} if len(recordings) > 1 else {}
             with Recording(FitFiles.of(self.out), self.capture, self.metadata) as recording:
-                recording.extend(packets, reports, **workers)
+                recording.extend(packets, reports, workers=self.peaks)
             _remove(folder)
             return reports
 
-    def _begun(self, progress: Progress) -> list[Chunk]:
+    def _begun(self) -> list[Chunk]:
         """Return the chunks after the common model, which is fitted if it is missing."""
         chunks = []
         for start, stop in pairwise(self.starts):
@@ -192,7 +191,7 @@ class ChunkedRun:
         stop = min(COMMON_FRAMES, first.stop)
         prepared = None
         if not first.frame:
-            prepared = Prepared.of(self.capture, self.task.config, progress)
+            prepared = Prepared.of(self.capture, self.task.config, self.progress)
             if prepared.capture is not self.capture:
                 points = (prepared.capture.points, prepared.capture.point_colors)
                 self.task = replace(self.task, points=points)
@@ -270,16 +269,4 @@ class ChunkedRun:
 
     def _show_progress(self) -> None:
         num_fitted = sum(len(recording.reports) for recording in self.recordings.values())
-        self.on_stage("Fitting frames", num_fitted, self.capture.num_frames)
-
-    def _complete(self) -> list[FrameReport] | None:
-        """Return the reports of an earlier fit that was finished, None if there is none."""
-        try:
-            stream = StreamReader(self.out / STREAM)
-        except (FileNotFoundError, TruncatedStreamError):
-            return None
-        check_same_fit(stream, self.capture, self.metadata)
-        frames = self.capture.num_frames
-        if not stream.closed() or stream.index()[-1][1] != frames - 1:
-            return None
-        return read_reports(self.out / REPORT, range(frames))
+        self.progress.of("Fitting frames")(num_fitted, self.capture.num_frames)

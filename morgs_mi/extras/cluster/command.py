@@ -27,15 +27,14 @@ class FitInChunks(Fit):
     The file overrides the preset; options override both.
     """
 
-    chunks: Annotated[int | None, optional("INT", "(default: 1)")] = None
+    chunks: int = 1
     """Number of parts of the recording that are fitted side by side, by the extra cluster; each
     begins with a keyframe."""
     scheduler: Annotated[str | None, optional("ADDRESS")] = None
     """Dask scheduler whose workers fit them, such as tcp://host:8786 (docs/captures.md)."""
 
     def run(self) -> None:
-        if self.chunks is not None:
-            check_value("fit()", "chunks", self.chunks, Count)
+        check_value("fit()", "chunks", self.chunks, Count)
         super().run()
 
     def fit(self, capture: Capture, out: Path, config: StreamConfig) -> list[FrameReport]:
@@ -43,9 +42,9 @@ class FitInChunks(Fit):
         from morgs_mi.extras.cluster.tasks import ChunkConfig
         from morgs_mi.extras.cluster.workers import open_client
 
-        if self.chunks is None and self.scheduler is None:
+        if self.chunks == 1 and self.scheduler is None:
             return super().fit(capture, out, config)
-        chunks = ChunkConfig(self.chunks or 1)
+        chunks = ChunkConfig(self.chunks)
         with (
             noting_chunks(out),
             progress() as report,

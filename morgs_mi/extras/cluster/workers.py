@@ -23,6 +23,7 @@ import cv2
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.platform.checks import require
 from morgs_mi.platform.environment import versions
 from morgs_mi.platform.interrupts import postponed
 from morgs_mi.platform.threads import usable_cores
@@ -52,11 +53,6 @@ _FAULTS = {
     "CommClosedError": _LOST,
     "ClosedClientError": _LOST,
     "FutureCancelledError": _LOST,
-    "deserialization": (
-        ValueError,
-        "a scheduler and workers with the versions of this client, got others that cannot read its "
-        "tasks; install the same versions on all machines",
-    ),
 }
 _BUSY = threading.Lock()  # Dask runs several tasks at once in a worker with several threads
 
@@ -72,7 +68,7 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             core.
 
     Raises:
-        ValueError: Dask is missing, or the workers have another version of it.
+        ValueError: Dask is missing.
         ConnectionError: no scheduler answers at the address, it has no worker, or is lost later.
         ChildProcessError: the workers died that ran a task.
     """
@@ -121,8 +117,6 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             yield client
         except (Exception, CancelledError) as error:
             name = type(error).__name__
-            if isinstance(error, RuntimeError) and "deserialization" in str(error):
-                name = "deserialization"
             if name not in _FAULTS:
                 raise
             kind, fault = _FAULTS[name]
@@ -165,12 +159,13 @@ def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[li
     Raises:
         ValueError: the worker has other versions than the client.
     """
-    for (name, expected), (_, version) in zip(versions, installed(), strict=True):
-        if expected != version:
-            raise ValueError(
-                f"{socket.gethostname()}: expected a worker with {name} {expected} like the "
-                f"client, got {version}; install the same versions on both."
-            )
+    require(
+        versions == installed(),
+        socket.gethostname(),
+        f"expected a worker with the client's versions, {dict({*versions} - {*installed()})}",
+        dict({*installed()} - {*versions}),
+        "install the same versions on both",
+    )
     messages: list[str] = []
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: messages.append(record.getMessage())
