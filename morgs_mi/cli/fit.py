@@ -159,9 +159,6 @@ def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
     except (KeyboardInterrupt, OSError) as error:
         with suppress(OSError, ValueError):
             if resume or stream.stat().st_mtime >= begin:
-                span = "no frame yet"
-                if index := StreamReader(stream).index():
-                    done = quantity(index[-1][1] + 1, "frame")
-                    span = f"{done} of {count}; continue with `--resume`"
-                error.add_note(f"{stream} holds {span}.")
+                frames = quantity(len(StreamReader(stream).frame_numbers()), "frame")
+                error.add_note(f"{stream} holds {frames} of {count}; continue with `--resume`.")
         raise

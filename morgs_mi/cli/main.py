@@ -123,7 +123,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        if options_type is Options and args == ["--version"]:
+        if args == ["--version"]:
             print_result(f"{prog} {version('morgs-mi')}")
             _flush_output()
             return 0
@@ -152,13 +152,17 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         if isinstance(error, BrokenPipeError) and error.filename == STDOUT:
             _drop_output()
             return _CLOSED
-        sentence = "Interrupted." if is_interruption(error) else sentence_of(error)
+        status = 1
+        sentence = sentence_of(error)
+        if is_interruption(error):
+            status = INTERRUPTED
+            sentence = "Interrupted."
         print_warning(" ".join([sentence, *getattr(error, "__notes__", [])]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:
             ERR.print_exception()
         _drop_output()
-        return INTERRUPTED if is_interruption(error) else 1
+        return status
 
 
 def _old_option(args: Sequence[str]) -> str:
