@@ -192,9 +192,8 @@ class ChunkedRun:
         prepared = None
         if not first.frame:
             prepared = Prepared.of(self.capture, self.task.config, self.progress)
-            if prepared.capture is not self.capture:
-                points = (prepared.capture.points, prepared.capture.point_colors)
-                self.task = replace(self.task, points=points)
+            points = (prepared.capture.points, prepared.capture.point_colors)
+            self.task = replace(self.task, points=points)
             self._use(prepared.capture)
         else:
             self._use(as_fitted(self.capture, StreamReader(self._files(0).stream)))

@@ -98,7 +98,8 @@ class Fit:
     versions: tuple[tuple[str, str], ...]  #: As `installed` returns them to the client.
     #: Refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
     rig: tuple[tuple[Camera, ...], tuple[tuple[float, float], ...]] | None = None
-    #: Points and their colours in place of the capture's, where those have been triangulated.
+    #: Points and their colours of the first frame, triangulated where the capture has few; None
+    #: after it.
     points: tuple[np.ndarray, np.ndarray] | None = None
     #: Exposures in the first frame of the recording, by view; empty before it is fitted.
     balance: tuple[Exposure, ...] = ()

@@ -173,13 +173,11 @@ def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[li
     with _BUSY:
         log.addHandler(handler)
         try:
-            if mi.variant() != variant:
-                mi.set_variant(variant)
+            mi.set_variant(variant)
             worker = _worker()
             threads = usable_cores() if worker is None else worker.state.nthreads
-            if dr.thread_count() != threads:
-                dr.set_thread_count(threads)
-                cv2.setNumThreads(threads)
+            dr.set_thread_count(threads)
+            cv2.setNumThreads(threads)
             yield messages
         finally:
             log.removeHandler(handler)
