@@ -101,5 +101,5 @@ def print_document(document: Mapping[str, Any]) -> None:
         table.columns[0].justify = "left"
         for row in rows:
             table.add_row(*row)
-        print_table(table)
+        print_table(table, ["first\nframe\ns"])
     print_result(f"\n{document['sentence']}\n{document['toml']}".rstrip())
