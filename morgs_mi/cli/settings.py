@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import reduce
 from operator import or_
@@ -18,6 +19,7 @@ from typing import (
 )
 
 from tyro.conf import FlagCreatePairsOff, arg, subcommand
+from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
@@ -120,15 +122,40 @@ def one_command(commands: Mapping[str, type]) -> Any:
     return arg(name="", constructor=union)
 
 
+def _offsets(words: list[str]) -> dict[str, float]:
+    """Return the offset of each camera from the words of --offset, a camera and a number in turn.
+
+    Raises:
+        ValueError: a word is missing, is no number, or names a camera a second time.
+    """
+    offsets: dict[str, float] = {}
+    with suppress(ValueError):
+        pairs = zip(words[::2], words[1::2], strict=True)
+        offsets = {name: float(number) for name, number in pairs}
+    if not words or 2 * len(offsets) != len(words):
+        raise ValueError(
+            "expected each camera once, with a number of frames, such as cam01 -0.5, got "
+            f"{' '.join(words) or 'nothing'}."
+        )
+    return offsets
+
+
+_OFFSETS = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="CAMERA FLOAT ...",
+    instance_from_str=_offsets,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda value: [word for pair in value.items() for word in map(str, pair)],
+)
+
+
 @options
 class Reading:
     """Options for differences between the clips of a capture: the fields of `ReadConfig`."""
 
     trim: Flag = False
     """Use the timestamps that all clips contain, at their lowest frame rate."""
-    offset: Annotated[dict[str, float], arg(metavar="CAMERA FLOAT ...")] = field(
-        default_factory=dict
-    )
+    offset: Annotated[dict[str, float], _OFFSETS] = field(default_factory=dict)
     """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it
     began later.
     """

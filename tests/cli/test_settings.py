@@ -136,12 +136,19 @@ def test_Reading__has_the_fields_of_the_config():
     assert Reading().read_config() == ReadConfig()
 
 
-@pytest.mark.parametrize("words", [["cam01", "abc"], ["cam01", "1", "cam02"]])
-def test_offset__refuses_what_is_no_pair(words, capsys):
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["cam01", "abc"], "such as cam01 -0.5, got cam01 abc."),
+        (["cam01", "1", "cam02"], "got cam01 1 cam02."),
+        (["cam01", "1", "cam01", "2"], "expected each camera once, with a number of frames"),
+    ],
+)
+def test_offset__refuses_what_is_no_pair(words, sentence, capsys):
     with pytest.raises(SystemExit):
         main(["info", "capture", "--offset", *words])
     captured = capsys.readouterr()
-    assert "Error parsing --offset" in captured.out + captured.err
+    assert sentence in " ".join((captured.out + captured.err).replace("│", " ").split())
 
 
 @pytest.mark.parametrize(
