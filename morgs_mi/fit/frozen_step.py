@@ -53,8 +53,7 @@ class Losses(NamedTuple):
     """Losses of a step."""
 
     by_name: Tensors  #: Scalars; those without a weight count with weight 1.
-    #: Number of entries that the lists should have had [1]; None: they were built before.
-    entries: UInt32 | None = None
+    entries: UInt32  #: Number of entries that the lists should have had [1].
     #: Zeros [N, 1] with gradients, and a scalar: its gradients there are the densification scores
     #: of the step; None: it has none.
     probe: tuple[Tensor, Tensor] | None = None
@@ -123,7 +122,7 @@ def frozen_step(
         width = len(setting.names) + 1
         place = dr.arange(mi.UInt32, _MOST_STEPS * width)
         column = place % width
-        value = mi.Float(0 if entries is None else entries)
+        value = mi.Float(entries)
         for k, name in enumerate(setting.names):
             if name in losses:
                 value = dr.select(column == k, mi.Float(dr.detach(losses[name])), value)
@@ -155,7 +154,7 @@ class RecordedSteps:
         views: by index.
         shared: arrays of all views.
         weights: of the losses by name; 1 where not named.
-        num_splats: that are drawn in a view, at most; None: lists are built before the steps.
+        num_splats: that are drawn in a view, at most.
         rows: number of Gaussians, the rows of the optimiser's parameters, and the number of rows
             that they are padded to.
         draw: further arrays of the view of each step; None: none.
@@ -169,7 +168,7 @@ class RecordedSteps:
         views: Mapping[int, StepView],
         shared: Inputs,
         weights: Mapping[str, float],
-        num_splats: int | None,
+        num_splats: int,
         rows: tuple[int, int],
         draw: Draw | None = None,
     ) -> None:
@@ -215,8 +214,7 @@ class RecordedSteps:
             if self._draw is not None:
                 self._first_state = self._draw.rng.bit_generator.state
             self._state = self._start(optimizer)
-            if self._num_splats is not None:
-                self._capacity = _list_capacity(self._num_splats)
+            self._capacity = _list_capacity(self._num_splats)
         steps = len(self.pending)
         decays = (optimizer.beta_1, optimizer.beta_2)
         scales = [
@@ -250,15 +248,14 @@ class RecordedSteps:
         steps = len(views)
         report = np.asarray(self._state["report"]).reshape(_MOST_STEPS, -1)[:steps]
         self.pending = []
-        if self._num_splats is not None:
-            most = int(report[:, -1].max())
-            if list(entries_per_splat) == [_ENTRIES_PER_SPLAT]:
-                entries_per_splat.clear()
-            entries_per_splat.append(most / self._num_splats)
-            if most >= self._capacity:  # a report has floats: a larger number may be rounded to it
-                if self._draw is not None:
-                    self._draw.rng.bit_generator.state = self._first_state
-                return None
+        most = int(report[:, -1].max())
+        if list(entries_per_splat) == [_ENTRIES_PER_SPLAT]:
+            entries_per_splat.clear()
+        entries_per_splat.append(most / self._num_splats)
+        if most >= self._capacity:  # a report has floats: a larger number may be rounded to it
+            if self._draw is not None:
+                self._draw.rng.bit_generator.state = self._first_state
+            return None
         for name, (value, promoted, rate, (t, *_)) in list(optimizer.state.items()):
             width = int(dr.prod(value.shape[1:]))
             arrays = [
@@ -317,13 +314,12 @@ sizes_by_name: dict[str, list[int]] = {}
 entries_per_splat: deque[float] = deque([_ENTRIES_PER_SPLAT], maxlen=4)  # of the last steps
 
 
-def room_for(name: str, number: int, room: float = _ROOM) -> int:
+def room_for(name: str, number: int) -> int:
     """Return a size that holds a number, one that was returned before if it is not too large.
 
     Args:
         name: of what is counted.
         number: of them.
-        room: size relative to the number where it is chosen.
     """
     sizes = sizes_by_name.setdefault(name, [])  # the last one is the one that was returned last
     number = max(number, 64)
@@ -332,7 +328,7 @@ def room_for(name: str, number: int, room: float = _ROOM) -> int:
         return sizes[-1]
     size = min(
         (size for size in sizes if _GROWTH * number <= size <= most),
-        default=-(-round(room * number) // 64) * 64,
+        default=-(-round(_ROOM * number) // 64) * 64,
     )
     sizes_by_name[name] = [*(other for other in sizes if other != size), size]
     return size

@@ -48,7 +48,6 @@ from morgs_mi.render.projection import Splats, TracedCamera, intrinsics_of, proj
 from morgs_mi.render.rasterize import Output, draw
 from morgs_mi.render.region import Region, full_view
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.render.shared_lists import SharedLists, ViewLists
 
 # Row past the last of a run of windows that walks no row.
 _NO_ROWS = -20
@@ -59,8 +58,6 @@ _MOST = 0.999
 # Number of active Gaussians below which there is room for as many: they cost less than another
 # recording.
 _LEAST_ACTIVE = 400
-# Room of the lists relative to their length, which varies more than the Gaussians and the blocks.
-_LIST_ROOM = 1.5
 
 
 @dataclass(frozen=True)
@@ -106,16 +103,17 @@ class LaterLosses:
             dr.enable_grad(features)
             channels = (*channels, "features")
         splats = project(gaussians, camera, channels, self.render, None, features)
-        dr.schedule(splats.blended)
+        is_gaussian = dr.arange(mi.UInt32, len(splats)) < shared["count"]
+        splats = replace(splats, valid=splats.valid & is_gaussian, finite=None)
+        dr.schedule(splats)
         detached = tuple(name for name in channels if name != "color")
         output = Output(channels, detached, self.render, region.shape(0)[:-1])
+        static = Splats(**view["static"])
         first = elements(view["static_range"], mi.UInt32(0))
         count = elements(view["static_range"], mi.UInt32(1))
         with dr.suspend_grad():
-            drawn = splats.followed_by(view["static"], first, count, self.num_static)
-        lists = ViewLists(SharedLists(**view["lists"]), view["first_block"])
-        background = view.get("background")
-        image, _ = draw(output, splats, drawn, region, background, lists=lists)
+            drawn = splats.followed_by(static, first, count, self.num_static)
+        image, lists = draw(output, splats, drawn, region, view.get("background"))
         prediction = Prediction(
             image,
             parameters,
@@ -129,9 +127,9 @@ class LaterLosses:
         losses = losses_of(prediction, observed, self.objective)
         losses = {**losses, SQUARED_ERROR: observed["target"].mse}
         if features is None:
-            return Losses(losses)
+            return Losses(losses, lists.total)
         term = attribution(image, *observed["target"].on_region)
-        return Losses(losses, probe=(features, term))
+        return Losses(losses, lists.total, (features, term))
 
 
 @dataclass(frozen=True)
@@ -201,16 +199,13 @@ class SharedSizes:
 
     Args:
         views: V >= 1 views.
-        builds_lists: whether steps build the lists of the blocks.
     """
 
-    def __init__(self, views: Sequence[ComparedView], builds_lists: bool) -> None:
+    def __init__(self, views: Sequence[ComparedView]) -> None:
         regions = [view.region for view in views]
         parts = [region.num_blocks for region in regions if not region.whole]
         self._blocks = room_for("blocks", max(parts)) if parts else 0
-        self._tiles = 0
-        if builds_lists:
-            self._tiles = room_for("tiles", max(region.num_tiles for region in regions) + 1)
+        self._tiles = room_for("tiles", max(region.num_tiles for region in regions) + 1)
         self._lanes = {
             name: room_for(name, max(len(view.on.runs[name]["end"]) for view in views))
             for name in views[0].on.runs
@@ -275,7 +270,7 @@ class LaterSteps:
         self._objective = objective
         self._views: dict[int, StepView] = {}
         compared_views = {v: ComparedView.of(view) for v, view in views.items()}
-        shared_sizes = SharedSizes([*compared_views.values()], builds_lists=False)
+        shared_sizes = SharedSizes([*compared_views.values()])
         for v, compared_view in compared_views.items():
             view = views[v]
             region = compared_view.region
@@ -312,20 +307,13 @@ class LaterSteps:
             names = (*(term.name for term in terms), SQUARED_ERROR)
             self._views[v] = StepView(losses, names, sizes, arrays)
 
-    def of(
-        self,
-        previous: Gaussians,
-        num_gaussians: int,
-        extent: float,
-        lists: Mapping[int, ViewLists],
-    ) -> RecordedSteps:
+    def of(self, previous: Gaussians, num_gaussians: int, extent: float) -> RecordedSteps:
         """Return the steps of some active Gaussians.
 
         Args:
             previous: N active Gaussians of the previous frame.
             num_gaussians: of the whole scene.
             extent: of the scene, world units.
-            lists: of the views, by their index.
         """
         count = len(previous)
         size = room_for("active Gaussians", max(count, _LEAST_ACTIVE))
@@ -335,21 +323,13 @@ class LaterSteps:
                 for name, value in previous.items().items()
                 if name not in ("motion", "offset")  # the residual replaces both
             },
+            "count": from_numpy(mi.UInt32, [count]),
             "offset_share": from_numpy(mi.Float, [1 / (num_gaussians * extent)]),
         }
         dr.make_opaque(shared)
-        shared_lists = {id(part.shared): part.shared for part in lists.values()}
-        arrays_of = {key: _padded_lists(part, count, size) for key, part in shared_lists.items()}
-        views = {}
-        for v, view in self._views.items():
-            arrays = {
-                **view.arrays,
-                "lists": arrays_of[id(lists[v].shared)],
-                "first_block": opaque(mi.UInt32, lists[v].first_block),
-            }
-            views[v] = view._replace(arrays=arrays)
         weights = weights_of(self._objective)
-        return RecordedSteps(views, shared, weights, None, (count, size))
+        num_splats = size + self._num_static
+        return RecordedSteps(self._views, shared, weights, num_splats, (count, size))
 
 
 class FirstSteps:
@@ -370,7 +350,7 @@ class FirstSteps:
         rng: np.random.Generator,
     ) -> None:
         compared_views = [ComparedView.of(view) for view in views]
-        shared_sizes = SharedSizes(compared_views, builds_lists=True)
+        shared_sizes = SharedSizes(compared_views)
         render = views[0].config
         self._views: dict[int, StepView] = {}
         for v, view in enumerate(compared_views):
@@ -413,23 +393,6 @@ def _is_plain(view: ActiveView) -> bool:
     )
 
 
-def _padded_lists(lists: SharedLists, count: int, size: int) -> dict[str, UInt32]:
-    """Return shared lists as arguments of a recording, in which static splats follow a `size`
-    of Gaussians instead of their number.
-    """
-    arrays = dict(vars(lists))
-    added = opaque(mi.UInt32, size - count)
-    entries = lists.entries
-    is_static = entries >= opaque(mi.UInt32, count)
-    arrays["entries"] = dr.select(is_static, entries + added, entries)
-    arrays = {
-        name: padded(values, room_for(f"lists, {name}", dr.width(values), _LIST_ROOM))
-        for name, values in arrays.items()
-    }
-    dr.eval(arrays)
-    return arrays
-
-
 def _row_shape(name: str, width: int) -> tuple[int, ...]:
     """Return the shape of a Gaussian's value of a raw attribute."""
     return (width // 3, 3) if name == "sh_coeffs" else BY_NAME[name].shape
@@ -439,9 +402,10 @@ def _columns(splats: Splats, size: int) -> dict[str, Any]:
     """Return splats as arguments of a recording, in arrays of a fixed size. A recording infers the
     size of a launch from an array of that size, and lengths that vary can coincide with it.
     """
+    names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid", "channels")
     lane = dr.arange(mi.UInt32, size)
     is_splat = lane < opaque(mi.UInt32, len(splats))
-    columns = dr.gather(dict, splats.blended, lane, is_splat)
+    columns = dr.gather(dict, {name: vars(splats)[name] for name in names}, lane, is_splat)
     dr.eval(columns)
     return columns
 
@@ -463,6 +427,9 @@ def _no_static(channels: Sequence[str], size: int) -> dict[str, Any]:
         "mean": mi.Point2f(zeros(2)),
         "conic": mi.Vector3f(zeros(3)),
         "log2_opacity": zeros(1)[0],
+        "depth": zeros(1)[0],
+        "radius": mi.Vector2f(zeros(2)),
+        "valid": from_numpy(mi.Bool, np.zeros(size, bool)),
         "channels": {name: tuple(zeros(widths[name])) for name in channels},
     }
 

@@ -43,17 +43,11 @@ from morgs_mi.method.objective import (
 from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.platform.progress import Progress
-from morgs_mi.render.active_view import lists_of_views, view_groups
 from morgs_mi.render.rasterize import check_rendering, render_view
-from morgs_mi.render.shared_lists import ViewLists
 
 # Fraction of the epochs after which the round of density control is due: the residual has shown by
 # then where Gaussians are missing, and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
-# Distance in px by which lists reach beyond a block: splats move while an epoch shares them.
-_MARGIN = 1.0
-# Number of Gaussians times views whose lists are built at once, at most: it bounds the memory.
-_MOST_SPLATS = 2**18
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,16 +189,14 @@ class _ResidualFit:
         if is_recordable(problem.views.values(), config.objective):
             views = problem.views
             self._later_steps = LaterSteps(views, self._optimizer, config.objective, motion)
-        self._groups = view_groups(problem.views, _MOST_SPLATS // len(self._previous))
-        self._views = problem.views  # with lists, which the steps of an epoch share
+        self._recorded_steps = self._recorded()
 
-    def _recorded_steps(self, lists: Mapping[int, ViewLists]) -> RecordedSteps | None:
-        """Return the steps with some lists as recordings; None if these do not exist."""
+    def _recorded(self) -> RecordedSteps | None:
+        """Return the steps of the active Gaussians as recordings; None if these do not exist."""
         if self._later_steps is None:
             return None
         problem = self._problem
-        num_gaussians = problem.active.num_gaussians
-        return self._later_steps.of(self._previous, num_gaussians, problem.extent, lists)
+        return self._later_steps.of(self._previous, problem.active.num_gaussians, problem.extent)
 
     def epoch(self, steps: Steps, rates: LearningRates, is_scored: bool) -> dict[str, float]:
         """Make the steps of an epoch, and return their mean losses by name.
@@ -219,15 +211,13 @@ class _ResidualFit:
             # epoch.
             count = len(self._problem.views)
             self._scores = ErrorPerGaussian(len(self.source), count - (count + 3) // 4)
-        lists = lists_of_views(self._groups, self._gaussians(), _MARGIN)
-        self._views = {v: replace(view, lists=lists[v]) for v, view in self._views.items()}
         return optimise(
             self._optimizer,
             rates.by_parameter(self._problem.extent),
             self._losses_at,
             replace(steps, observer=self._scores),
             weights_of(self._config.objective),
-            self._recorded_steps(lists),
+            self._recorded_steps,
         )
 
     def density_round(self, rng: np.random.Generator) -> None:
@@ -243,6 +233,7 @@ class _ResidualFit:
         self._previous = apply_plan(self._previous, plan)
         self.source = plan.source
         self._scores = None
+        self._recorded_steps = self._recorded()
 
     def _gaussians(self) -> Gaussians:
         """Return the active Gaussians after the residual."""
@@ -263,7 +254,7 @@ class _ResidualFit:
         """Render one view and return its losses by name."""
         problem = self._problem
         objective = self._config.objective
-        view = self._views[index]
+        view = problem.views[index]
         observed = view.observations
         scores = self._scores
         channels = channels_of(observed, objective)

@@ -10,7 +10,7 @@ one loop walks them all.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.arrays import concatenated, from_numpy, opaque
+from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.types import Float, Tensor, UInt32
@@ -32,7 +32,6 @@ from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import Splats, TracedCameras, project
 from morgs_mi.render.region import BlockGrid, Region, joined, quotient_and_rest
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.render.shared_lists import SharedLists, ViewLists
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +49,10 @@ class StaticSplats:
     def alone(self) -> Splats:
         """The view's splats."""
         with dr.suspend_grad():
-            splats = self.of_view(self.together.channels)
+            lane = dr.arange(mi.UInt32, self.count) + opaque(mi.UInt32, self.first)
+            splats = self.together.at(lane)
             dr.eval(splats)
         return splats
-
-    def of_view(self, channels: Iterable[str], view: int | None = None) -> Splats:
-        """Return the view's splats with some channels, and perhaps the index of the view."""
-        lane = dr.arange(mi.UInt32, self.count) + opaque(mi.UInt32, self.first)
-        blended = {name: self.together.channels[name] for name in channels}
-        splats = replace(self.together, channels=blended).at(lane)
-        return splats if view is None else replace(splats, view=dr.full(mi.UInt32, view, len(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +68,6 @@ class ActiveView:
     region: Region | None = None  #: The blocks of pixels that are drawn; None: the whole view.
     #: Further splats that are drawn there and get no gradients; None: none.
     static_splats: StaticSplats | None = None
-    #: Lists of its blocks that several renderings share, see `ViewGroup.lists`; None: each
-    #: rendering makes its own.
-    lists: ViewLists | None = None
 
     def __post_init__(self) -> None:
         place = "ActiveView()"
@@ -141,7 +131,7 @@ def narrowed(views: Mapping[int, AnyActiveView], blocks: np.ndarray) -> dict[int
         if view.region is not None:
             requested = requested & view.region.drawn
         if requested.any():
-            result[v] = replace(view, region=Region(view.grid, requested), lists=None)
+            result[v] = replace(view, region=Region(view.grid, requested))
     return result
 
 
@@ -184,15 +174,15 @@ class ViewGroup:
         """The cameras of the views."""
         return TracedCameras.of([view.camera for view in self.views])
 
-    def _touching(self, gaussians: ActivatedGaussians, margin: float = 0.0) -> UInt32:
+    def _touching(self, gaussians: ActivatedGaussians) -> UInt32:
         """Return (view * N + Gaussian), ascending, of each of N > 0 Gaussians in each view that has
-        a block from which it is at most a margin in px away.
+        a block that it touches.
         """
         N = int(gaussians.means.shape[0])
         with dr.suspend_grad():
             view, row = quotient_and_rest(dr.arange(mi.UInt32, N * len(self.views)), N)
             splats = project(gaussians, self._cameras.of_each(view), (), self.config, row)
-            return dr.compress(touches(splats.grown(margin), self.region))
+            return dr.compress(touches(splats, self.region))
 
     def with_static(
         self, static: ActivatedGaussians, channels: Sequence[str]
@@ -244,52 +234,26 @@ class ViewGroup:
             lists = build_lists(splats, list(splats.channels["color"]), self.region, self.config)
         return Drawing(self, (splats, lists), lanes, N)
 
-    @with_render_lock
-    def lists(self, gaussians: ActivatedGaussians, margin: float) -> tuple[ViewLists, ...]:
-        """Return the lists of each view's blocks, which several renderings of the view share.
-
-        Args:
-            gaussians: N > 0 Gaussians, detached.
-            margin: distance in px by which splats may move until the last of these renderings.
-        """
-        N = int(gaussians.means.shape[0])
-        with dr.suspend_grad():
-            lanes = self._touching(gaussians, margin)
-            if not dr.width(lanes):  # a splat that no block lists
-                lanes = dr.zeros(mi.UInt32, 1)
-            view, number = quotient_and_rest(lanes, N)
-            splats = project(gaussians, self._cameras.of_each(view), (), self.config, number)
-            static = self._static_splats(())
-            if static is not None:  # these come after the Gaussians of their view
-                splats = splats.concatenated_with(static)
-                counts = [len(view.static_splats or ()) for view in self.views]
-                numbers = np.concatenate([N + np.arange(count) for count in counts])
-                number = concatenated([number, from_numpy(mi.UInt32, numbers)])
-            lists = build_lists(splats, [], self.region, self.config, margin=margin)
-            counts = [view.drawn.num_blocks for view in self.views]
-            view_of = from_numpy(mi.UInt32, np.arange(len(counts)).repeat(counts))
-            shared = SharedLists.of(lists, number, view_of, len(counts))
-        firsts = np.cumsum([0, *counts[:-1]]).tolist()
-        return tuple(ViewLists(shared, first) for first in firsts)
-
     @cached_property
     def _static(self) -> Splats | None:
         """The static splats of all views that touch their regions; None if there are none."""
-        splats = self._static_splats(("color",))
-        if splats is None:
-            return None
-        dr.eval(splats)  # one kernel, not one for each column that is read below
-        rows: Any = dr.compress(touches(splats, self.region))
-        return splats.at(rows) if dr.width(rows) else None
-
-    def _static_splats(self, channels: tuple[str, ...]) -> Splats | None:
-        """Return the static splats of all views with some channels; None if there are none."""
         parts = [
-            view.static_splats.of_view(channels, index)
+            replace(
+                view.static_splats.alone,
+                view=dr.full(mi.UInt32, index, len(view.static_splats)),
+                channels={"color": view.static_splats.alone.channels["color"]},
+            )
             for index, view in enumerate(self.views)
             if view.static_splats is not None
         ]
-        return parts[0].concatenated_with(*parts[1:]) if parts else None
+        if not parts:
+            return None
+        splats = parts[0].concatenated_with(*parts[1:])
+        dr.eval(splats)  # one kernel, not one for each column that is read below
+        rows: Any = dr.compress(touches(splats, self.region))
+        if not dr.width(rows):
+            return None
+        return splats.at(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,24 +335,6 @@ class Drawing:
             for k, values in enumerate(lane_sums):
                 dr.scatter(sums, values, lane + k, mode=dr.ReduceMode.NoConflicts)
         return np.asarray(sums).reshape(-1, channels)
-
-
-def view_groups(views: Mapping[int, ActiveView], most: int) -> Mapping[Sequence[int], ViewGroup]:
-    """Return views in groups of `most`, or of one, by their indices."""
-    indices = sorted(views)
-    size = max(most, 1)
-    parts = [tuple(indices[k : k + size]) for k in range(0, len(indices), size)]
-    return {part: ViewGroup([views[v] for v in part]) for part in parts}
-
-
-def lists_of_views(
-    groups: Mapping[Sequence[int], ViewGroup], gaussians: ActivatedGaussians, margin: float
-) -> Mapping[int, ViewLists]:
-    """Return the lists of each view's blocks, by its index, see `ViewGroup.lists`."""
-    lists: dict[int, ViewLists] = {}
-    for indices, group in groups.items():
-        lists |= zip(indices, group.lists(gaussians, margin), strict=True)
-    return lists
 
 
 def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarray) -> np.ndarray:

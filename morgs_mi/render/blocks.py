@@ -70,7 +70,6 @@ def build_lists(
     region: DrawnBlocks,
     config: RenderConfig,
     limits: Float | None = None,
-    margin: float = 0.0,
 ) -> BlockLists:
     """List the splats (N > 0) that may touch each block of a region, nearest first.
 
@@ -81,10 +80,8 @@ def build_lists(
         config: cut-offs.
         limits: depth limit of every pixel of the view [H W], which the splats' profiles are
             compared with.
-        margin: distance from a block in px at which splats are listed as well.
     """
     N = len(splats)
-    splats = splats.grown(margin)
     # Each splat's first tile, its tiles across, and the number of its tiles in the region.
     low, high, counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
     rectangles = _Rectangles(low, high.x - low.x, dr.select(splats.valid, counts, 0))
@@ -100,7 +97,7 @@ def build_lists(
         records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N)
     )
     farthest = None if limits is None else _farthest_limits(limits, region)
-    words, end_word, length = _block_bits(geometry, tiles, region, config, farthest, margin)
+    words, end_word, length = _block_bits(geometry, tiles, region, config, farthest)
     length = elements(length, region.tile)
     begin = (elements(end_word, region.tile) - length) * 32 + region.bit
     end = begin + length * 32
@@ -330,14 +327,12 @@ def _block_bits(
     region: DrawnBlocks,
     config: RenderConfig,
     farthest_limits: Float | None,
-    margin: float,
 ) -> tuple[UInt32, UInt32, UInt32]:
     """Return (words, end word of each tile, number of its words) for the geometry of the entries.
 
     Bit k of word 32 w + b is set if block b of the tile is touched by entry 32 w + k, both counted
     from the tile's first.
     """
-    inset = 0.5 - margin  # from the edge of a block to what is tested
     bw, bh = region.block
     num_tiles = region.num_tiles
     length = (tiles.end - tiles.first + 31) // 32
@@ -356,21 +351,21 @@ def _block_bits(
     reach = log2_opacity - log2(config.alpha_min) + _TEST_SLACK
     columns = []
     for i in range(ACROSS):
-        x0 = px + (i * bw + inset)
-        x1 = px + (i * bw + bw - inset)
+        x0 = px + (i * bw + 0.5)
+        x1 = px + (i * bw + bw - 0.5)
         x = _clipped(0, x0, x1)
         columns.append((x0, x1, a * x, slope_y * x))
     left = columns[0][0]
     right = columns[-1][1]
-    top = py + inset
-    bottom = py + (DOWN * bh - inset)
+    top = py + 0.5
+    bottom = py + (DOWN * bh - 0.5)
     if farthest_limits is not None:
         z, gx, gy, r_sigma = profile
         nearest = [z + dr.minimum(gx * x0, gx * x1) for x0, x1, *_ in columns]
     mask = mi.UInt32(0)
     for j in range(DOWN):
-        y0 = py + (j * bh + inset)
-        y1 = py + (j * bh + bh - inset)
+        y0 = py + (j * bh + 0.5)
+        y1 = py + (j * bh + bh - 0.5)
         if farthest_limits is not None:
             row = dr.minimum(gy * y0, gy * y1)
             farthest = dr.gather(mi.Vector4f, farthest_limits, slot * DOWN + j)

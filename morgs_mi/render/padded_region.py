@@ -32,8 +32,7 @@ class PaddedSizes:
     grid: BlockGrid  #: All blocks of the view.
     whole: bool  #: Whether its images are those of the whole view, see `Region`.
     num_blocks: int  #: Blocks that it has room for; all, if it is whole.
-    #: Tiles, of which the last one is beside the view; 0: lists are not built on it.
-    num_tiles: int
+    num_tiles: int  #: Tiles, of which the last one is beside the view.
     is_partial: bool  #: Whether some pixels of its blocks may lie outside the view.
     capacity: int  #: Entries of the lists.
 
@@ -74,17 +73,16 @@ def padded_arrays(region: Region, sizes: PaddedSizes) -> dict[str, np.ndarray]:
     host = region.host
     block_width, block_height = region.block
     # Blocks without splats are drawn, too, because losses read their pixels.
-    fills = {"x": _BESIDE, "y": 0, "rows": block_height}
+    fills = {"tile": 0, "bit": 0, "x": _BESIDE, "y": 0, "rows": block_height}
     places = np.arange(blocks) * (block_width * block_height // 4)
-    arrays = {"pitch": host["pitch"], "place": host["place"] if region.whole else places}
-    if sizes.num_tiles:
-        fills |= {"tile": 0, "bit": 0}
-        arrays |= {name: host[name] for name in ("slot_of", "tile_table")}
-    arrays |= {name: filled(host[name], blocks, fill) for name, fill in fills.items()}
+    arrays = {
+        **{name: filled(host[name], blocks, fill) for name, fill in fills.items()},
+        **{name: host[name] for name in ("pitch", "slot_of", "tile_table")},
+        "place": host["place"] if region.whole else places,
+    }
     arrays = {name: np.asarray(values, np.uint32) for name, values in arrays.items()}
-    if sizes.num_tiles:
-        for name in ("corner_x", "corner_y"):
-            arrays[name] = filled(host[name], sizes.num_tiles, _FAR)
+    for name in ("corner_x", "corner_y"):
+        arrays[name] = filled(host[name], sizes.num_tiles, _FAR)
     *_, lanes = sections(region.num_blocks)
     arrays["counts"] = np.array([region.num_blocks, lanes], np.uint32)
     return arrays

@@ -22,7 +22,7 @@ scene, single precision would lose the digits that cancel.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import log2, sqrt
@@ -109,10 +109,6 @@ class Splats:
         """The fields that are not None."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
-    def grown(self, margin: float) -> Splats:
-        """Return the splats with boxes that are larger on all sides, by a margin in px."""
-        return replace(self, radius=self.radius + margin) if margin else self
-
     def at(self, rows: UInt32) -> Splats:
         """Return the splats with these indices [M]."""
         return Splats(**dr.gather(dict, self._present, rows))
@@ -124,48 +120,28 @@ class Splats:
         dr.eval(parts)
         return Splats(**concatenated(parts))
 
-    @property
-    def blended(self) -> dict[str, Jit]:
-        """What is blended, given lists: all but depth, box and validity."""
-        return {name: vars(self)[name] for name in ("mean", "conic", "log2_opacity", "channels")}
-
-    def followed_by(
-        self, others: dict[str, Jit], first: UInt32, count: UInt32, size: int
-    ) -> Splats:
-        """Return these splats, then some others, of which only `blended` is known, for lists that
-        exist: `count` of them from an index on, which are not copied before, in an array of `size`.
+    def followed_by(self, others: Splats, first: UInt32, count: UInt32, size: int) -> Splats:
+        """Return these splats, then some others, which are not copied before: `count` of them from
+        an index on, and splats that are not valid up to a `size`.
         """
-        own = self.blended
+        own = self._present
         dr.eval(own)
         lane = dr.arange(mi.UInt32, len(self) + size)
         is_own = lane < len(self)
         place = lane - len(self)
         is_other = ~is_own & (place < count)
         own = dr.gather(dict, own, lane, is_own)
-        channels = self._completed(others["channels"], dr.width(others["log2_opacity"]))
-        others = {**others, "channels": channels}
-        following = dr.gather(dict, others, first + place, is_other)
-        unknown = dr.zeros(mi.Float, dr.width(lane))
-        return Splats(
-            **dr.select(is_own, own, following),
-            depth=unknown,
-            radius=mi.Vector2f(unknown),
-            valid=unknown == 0,
-        )
+        following = dr.gather(dict, self._fields_of(others), first + place, is_other)
+        return Splats(**dr.select(is_own, own, following))
 
     def _fields_of(self, others: Splats) -> dict[str, Jit]:
-        """Return those fields of other splats that these have."""
-        channels = self._completed(others.channels, len(others))
-        return {**{name: vars(others)[name] for name in self._present}, "channels": channels}
-
-    def _completed(
-        self, channels: Mapping[str, tuple[Float, ...]], count: int
-    ) -> dict[str, tuple[Float, ...]]:
-        """Return the channels of `count` other splats, 0 where they lack one of these."""
-        return {
-            name: channels.get(name) or tuple(dr.zeros(mi.Float, count) for _ in columns)
+        """Return those fields of other splats that these have; channels that they lack are 0."""
+        channels = {
+            name: others.channels.get(name)
+            or tuple(dr.zeros(mi.Float, len(others)) for _ in columns)
             for name, columns in self.channels.items()
         }
+        return {**{name: vars(others)[name] for name in self._present}, "channels": channels}
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import FARTHEST, Splats, project
 from morgs_mi.render.region import DrawnBlocks, full_view
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.render.shared_lists import ViewLists
 
 # Beside the channels color, depth, motion and confidence, a record then takes seven packets of 4
 # floats.
@@ -239,8 +238,7 @@ def render_view(
     if not int(gaussians.means.shape[0]):
         return _nothing(output, table, region, background)
     rows = None
-    lists = view.lists if limits is None else None  # a limit shortens them
-    if not region.whole and view.static_splats is None and lists is None:
+    if not region.whole and view.static_splats is None:
         # Those that touch no block are not blended.
         with dr.suspend_grad():
             bare = project(dr.detach(gaussians), camera, (), view.config)
@@ -263,7 +261,7 @@ def render_view(
     if static is not None:  # these get no gradients
         with dr.suspend_grad():
             drawn = splats.concatenated_with(static.alone)
-    return draw(output, splats, drawn, region, background, limits, absolute, lists)[0]
+    return draw(output, splats, drawn, region, background, limits, absolute)[0]
 
 
 @dataclass(frozen=True)
@@ -289,7 +287,6 @@ def draw(
     background: Sequence[float] | Jit | None = None,
     limits: Float | None = None,
     absolute: tuple[Float, ...] = (),
-    lists: ViewLists | None = None,
 ) -> tuple[Image, BlockLists]:
     """Return the image of splats on a region, and their lists.
 
@@ -301,15 +298,11 @@ def draw(
         background: as for `rasterize`.
         limits: flat depth limits of the pixels of the view.
         absolute: as for `blend`.
-        lists: that several renderings share; None: they are built here.
     """
     blended = output.blended
     with dr.suspend_grad():
         columns = [column for name in blended for column in drawn.channels[name]]
-        if lists is None:
-            block_lists = build_lists(drawn, columns, region, output.config, limits)
-        else:
-            block_lists = lists.of(drawn, columns, region)
+        lists = build_lists(drawn, columns, region, output.config, limits)
     sizes = {**{name: len(splats.channels[name]) for name in blended}, "alpha": 1}
     # Divided by the sum of the weights, or composited by it over the background.
     weighted = NORMALISED if background is None else (*NORMALISED, "color")
@@ -323,7 +316,7 @@ def draw(
         bool(absolute),
     )
     values = [splats.channels[name] for name in blended]
-    images = blend(splats.geometry, values, region, block_lists, layout, absolute)
+    images = blend(splats.geometry, values, region, lists, layout, absolute)
     images = dict(zip((*blended, "alpha", "coverage"), images, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
@@ -338,7 +331,7 @@ def draw(
         name: _tensor(images[name], region, (*output.shape, sizes[name]))
         for name in output.channels
     }
-    return _image(tensors), block_lists
+    return _image(tensors), lists
 
 
 def _image(tensors: Tensors) -> Image:
