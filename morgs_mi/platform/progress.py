@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import html
 import math
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 Report = Callable[[str, float, float], None]
 """Function that is called with (stage, done, total)."""
@@ -81,39 +83,55 @@ class Progress:
 class ProgressBar:
     """Progress bar, to be passed to a long call.
 
-    In a notebook and on a terminal it is a line; otherwise nothing is shown.
+    In a notebook it is an element of the cell's output, on a terminal a line; otherwise nothing is
+    shown.
 
     Args:
         title: what is done.
+        total: number of steps, if the call does not report it.
 
     Example:
         >>> evaluate_stream("out/fit", progress=ProgressBar("Evaluating"))
         >>> stream_capture(capture, "out/fit", progress=ProgressBar("Fitting").report)
     """
 
-    def __init__(self, title: str) -> None:
+    def __init__(self, title: str, total: float | None = None) -> None:
         self._title = title
+        self._total = total
         self._stage = ""
         self._begin = time.monotonic()
         self._shown = -math.inf
         self._first = math.inf
+        self._output: Any = None
 
-    def __call__(self, done: float, total: float) -> None:
+    def __call__(self, done: float, total: float | None = None) -> None:
         """Show that `done` steps of `total` are done."""
+        total = total or self._total
         moment = time.monotonic()
         if moment - self._shown < _PERIOD and done != total:
             return
         self._shown = moment
-        share = f"{done:.0f}/{total:.0f}"
+        share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
         seconds = moment - self._begin
         text = f"{share}, {duration(seconds)}"
         self._first = min(done, self._first)
-        left = time_left(seconds, done, total, self._first)
+        left = time_left(seconds, done, total or done, self._first)
         if left:
             text = f"{share}, about {duration(left)} left"
         name = f"{self._title}: {self._stage}" if self._stage else self._title
-        if is_notebook() or sys.stderr.isatty():
-            bar = round(_WIDTH * done / max(total, 1)) * "━"
+        if is_notebook():
+            from IPython.display import HTML, display  # type: ignore[import-not-found]
+
+            content = HTML(
+                f'<div>{html.escape(name)} <progress value="{done if total else 0}" '
+                f'max="{total or 1}" style="width:20em"></progress> {text}</div>'
+            )
+            if self._output is None:
+                self._output = display(content, display_id=True)
+            else:
+                self._output.update(content)
+        elif sys.stderr.isatty():
+            bar = round(_WIDTH * done / total) * "━" if total else ""
             end = "\n" if done == total else ""
             sys.stderr.write(f"\r{name} {bar:{_WIDTH}} {text}{end}")
             sys.stderr.flush()

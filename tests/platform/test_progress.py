@@ -2,6 +2,9 @@
 
 import io
 import sys
+from types import SimpleNamespace
+
+import pytest
 
 from morgs_mi.platform import progress
 from morgs_mi.platform.progress import Progress, ProgressBar, name_of, time_left
@@ -41,19 +44,24 @@ def test_progress_bar__writes_nothing_into_a_file(monkeypatch):
     assert sys.stderr.getvalue() == ""
 
 
-def test_progress_bar__is_a_line_in_a_notebook(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
+def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
+    display = pytest.importorskip("IPython.display", reason="comes with the extra `notebooks`")
+    shown = []
+
+    def show(content, display_id):
+        assert display_id
+        shown.append(content.data)
+        return SimpleNamespace(update=lambda content: shown.append("updated: " + content.data))
+
+    monkeypatch.setattr(display, "display", show)
     monkeypatch.setattr(progress, "is_notebook", lambda: True)
-    bar = ProgressBar("Fitting")
-    bar.report("First frame", 0, 0)
-    bar.report("Later frames", 0.5, 3)
-    bar.report("Later frames", 3, 3)
-    lines = sys.stderr.getvalue().split("\r")
-    assert [line.partition(" ━")[0].split("  ")[0] for line in lines[1:]] == [
-        "Fitting: First frame",
-        "Fitting: Later frames",
-        "Fitting: Later frames",
-    ]
+    bar = ProgressBar("Fitting <arm>")
+    bar.report("First frame", 0.5, 3)
+    bar.report("First frame", 3, 3)
+    assert "Fitting &lt;arm&gt;" in shown[0]
+    assert 'value="0.5" max="3"' in shown[0]
+    assert shown[1].startswith("updated: ")
+    assert 'value="3" max="3"' in shown[1]
 
 
 def test_progress__reports_its_stage():
