@@ -7,7 +7,7 @@ all pixels and in the silhouette of a person, whose outlines a file has. "Neares
 image of the nearest other camera, "one colour" is the mean of the others. "Random points" are at
 the depths at which most views agree, "found" is the start of `fit_gaussians`.
 
-"Silhouettes" has those of the fitted views as well: a room is fitted without the person, and the
+"Silhouettes" uses silhouettes of the fitted views: a room is fitted without the person, and the
 person alone, from points of their visual hull, before random colours. The number is the weight of
 the difference of its opacity and the silhouettes.
 """

@@ -133,7 +133,7 @@ class Options(StudyOptions):
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the scores by method, or those of a single method by clip."""
+        """Return the scores by method, or the scores of a single method by clip."""
         return scenes_table(rows) if len(self.methods) == 1 else field_table(rows)
 
     def run(self) -> list[Row]:

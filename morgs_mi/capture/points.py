@@ -22,9 +22,9 @@ from morgs_mi.fit.stereo import stereo_points
 def match_capture(
     capture: Capture, progress: Callable[[int, int], None] | None = None
 ) -> SharedFeatures:
-    """Return the features of the first frame, in pixels of the recorded size, and their matches;
-    takes about 0.6 s per view and 0.03 s per
-    pair.
+    """Return the features of the first frame, in pixels of the recorded size, and their matches.
+
+    It takes about 0.6 s per view and 0.03 s per pair.
 
     A view without an image has no features.
 

@@ -45,8 +45,18 @@ EXAMPLE = (
 # Folders of other images than colours and folders without clips, and folders with images that do
 # not belong to a camera of their name.
 _NOT_CLIPS = {
-    *("alpha", "depth", "depths", "infrared", "ir", "mask", "masks", "normal", "normals", "seg"),
-    *("sparse", "truth"),
+    "alpha",
+    "depth",
+    "depths",
+    "infrared",
+    "ir",
+    "mask",
+    "masks",
+    "normal",
+    "normals",
+    "seg",
+    "sparse",
+    "truth",
 }
 # Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
 _COPIES = r"images_[0-9]+"
