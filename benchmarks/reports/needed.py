@@ -100,6 +100,8 @@ def acts_on(branch: Branch, recording: Recording) -> bool:
 
 _CHEAP = {"fit": _SMALL, "motion": _MASKS}
 _RECORDED = {"fit": {"epochs": 2}, "motion": _MASKS}
+# First frames of recordings in less than two minutes.
+_STILL = {"fit": {"num_gaussians": 20_000, "first_frame_steps": 800}}
 RECORDINGS = {
     "demo": Recording(4, 2, settings=_CHEAP),
     "random-41": Recording(4, settings=_CHEAP, seed=41),
@@ -107,9 +109,9 @@ RECORDINGS = {
     "demo-12": Recording(12, 2, settings={"fit": _SMALL}),
     "basketball": Recording(4, hold_out=(0, 10, 15, 30), settings=_RECORDED),
     "walk4": Recording(3, 4, (1,), {"motion": {"mask_interval": 2}}),
-    "flame_steak": Recording(1, 2),
-    "meet_room": Recording(1, 2, ("cam_0",)),
-    "fern": Recording(1, 2, (0, 8, 16)),
+    "flame_steak": Recording(1, 2, settings=_STILL),
+    "meet_room": Recording(1, 2, ("cam_0",), _STILL),
+    "fern": Recording(1, 2, (0, 8, 16), _STILL),
 }
 """Sets by name, the cheap ones first."""
 
