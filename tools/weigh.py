@@ -1,4 +1,5 @@
-"""Count what a reader of the project decides and steps through, and write it into CONTRIBUTING.md.
+"""Count what a reader of the project decides and steps through, print the counts of each subpackage
+and write the sums into CONTRIBUTING.md.
 
     python tools/weigh.py
 
@@ -16,7 +17,7 @@ from __future__ import annotations
 import ast
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -90,25 +91,32 @@ def module_counts(folder: str) -> dict[Path, Counter[str]]:
     return {path: counts_of(path.read_text(encoding="utf-8")) for path in paths}
 
 
+def table(rows: Mapping[str, Counter[str]]) -> str:
+    """Return a Markdown table with a row of counts for each name."""
+    lines = [f"| | {' | '.join(COUNTS)} |", f"|---|{'---:|' * len(COUNTS)}"]
+    for name, counts in rows.items():
+        lines.append(f"| {name} | {' | '.join(f'{counts[count]:,}' for count in COUNTS)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
-    """Write a row for each subpackage and folder of modules, and the words of the pages."""
+    """Print a row for each subpackage and folder of modules, and write the rows of the folders and
+    the words of the pages.
+    """
     package = module_counts("morgs_mi")
     rooms: dict[str, list[Counter[str]]] = {}
     for path, counts in package.items():
         rooms.setdefault(room_of(path), []).append(counts)
-    rows = {name: total(modules) for name, modules in sorted(rooms.items())}
-    rows["**morgs_mi**"] = total(package.values())
-    rows |= {name: total(module_counts(name).values()) for name in FOLDERS}
-    lines = [f"| | {' | '.join(COUNTS)} |", f"|---|{'---:|' * len(COUNTS)}"]
-    for name, counts in rows.items():
-        lines.append(f"| {name} | {' | '.join(f'{counts[count]:,}' for count in COUNTS)} |")
+    folders = {"morgs_mi": total(package.values())}
+    folders |= {name: total(module_counts(name).values()) for name in FOLDERS}
+    print(table({name: total(modules) for name, modules in sorted(rooms.items())}))
     pages = [
         page
         for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
         if not {"api", "_build"} & {*page.parts} and page.name != "changelog.md"
     ]
     words = sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
-    text = "\n".join([*lines, "", f"README and pages: {len(pages)} files, {words:,} words.", ""])
+    text = f"{table(folders)}\n\nREADME and pages: {len(pages)} files, {words:,} words.\n"
     print(text)
     before, _, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     after = rest.partition(MARKS[1])[2]
