@@ -1,8 +1,5 @@
 """Calibrations of EasyMocap and EasyVolcap: forms of the files, and projections against OpenCV."""
 
-import re
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -20,6 +17,23 @@ from tests.scenes.captures import (
     dot_clips,
     videos,
 )
+
+EXTRINSICS = """\
+%YAML:1.0
+---
+names:
+  - "01"
+R_01: !!opencv-matrix
+  rows: 3
+  cols: 1
+  dt: d
+  data: [0.0, 0.0, 0.0]
+T_01: !!opencv-matrix
+  rows: 3
+  cols: 1
+  dt: d
+  data: [0.0, 0.0, 4.0]
+"""
 
 
 @pytest.mark.parametrize("clips", [layouts.folder_per_camera, videos])
@@ -82,10 +96,8 @@ def test_easymocap__uses_no_silhouettes_as_masks(tmp_path, caplog):
     assert f"{path / 'masks'}: not used, because masks of each frame are not read." in caplog.text
 
 
-def test_captures_page__easymocap_example_is_read_as_described(tmp_path):
-    page = Path(__file__).parents[3] / "docs" / "captures.md"
-    (example,) = re.findall(r"```text\n(%YAML.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    (tmp_path / "extri.yml").write_text(example)
+def test_easymocap__reads_files_as_the_page_describes_them(tmp_path):
+    (tmp_path / "extri.yml").write_text(EXTRINSICS)
     (tmp_path / "intri.yml").write_text(
         "%YAML:1.0\n---\nK_01: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n"
         "  data: [900., 0., 639.5, 0., 900., 359.5, 0., 0., 1.]\n"
