@@ -211,19 +211,12 @@ def profile_fit(out: Path, frame: int, epochs: int) -> dict[str, dict[str, float
 
 
 def table(profiles: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """Return the profiles as a table, a stage per row, in the order of the frame."""
+    """Return the seconds of the profiles as a table, a stage per row, in the order of the frame."""
     names = [*dict.fromkeys(name for name, *_ in STAGES), "other", "total"]
-    rows = []
-    for name in names:
-        cells = [name]
-        for profile in profiles.values():
-            stage = profile.get(name)
-            if stage is None:
-                cells.append("-")
-            else:
-                passes = f"{stage['passes']}, " if stage["passes"] else ""
-                cells.append(f"{stage['seconds']:.2f} ({passes}{100 * stage['serial']:.0f} %)")
-        rows.append(cells)
+    rows = [
+        (name, *(f"{p[name]['seconds']:.2f}" if name in p else "-" for p in profiles.values()))
+        for name in names
+    ]
     return markdown(("stage", *profiles), rows)
 
 
