@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.pages.results import committed
 from benchmarks.reports import far_cameras, field, held_out, needed, stability, starts
 from benchmarks.reports.plots import markdown
-from benchmarks.speed import host, stages
+from benchmarks.speed import stages
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -67,6 +67,12 @@ def fuzz() -> str:
     return markdown(("fuzzer", "what is changed", "streams"), rows, left=2)
 
 
+def stage_seconds() -> str:
+    """Return the seconds of the stages of a large synthetic scene and of a recording."""
+    profiles = committed("stages")["profiles"]
+    return stages.table({name: profiles[name] for name in ("n3dv, frame 3", "basketball, frame 7")})
+
+
 def trial_table(table: Callable[..., str]) -> str:
     """Return a table of the trial of branches."""
     return table(needed.rows_of(committed("what_is_needed")))
@@ -81,10 +87,9 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(
         committed("held_out")["fits"], committed("held_out_seeds")["fits"]
     ),
-    "host": lambda: host.sizes_table(committed("host")["sizes"]),
     "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
-    "stages": lambda: stages.table(committed("stages")["profiles"]),
+    "stages": stage_seconds,
     **{
         f"trial_{name}": partial(trial_table, table)
         for name, table in (
