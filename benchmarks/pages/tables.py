@@ -9,7 +9,6 @@ from typing import Any
 from benchmarks.pages.results import committed
 from benchmarks.reports import far_cameras, field, held_out, needed, starts
 from benchmarks.reports.plots import markdown
-from benchmarks.speed import stages
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -67,12 +66,6 @@ def fuzz() -> str:
     return markdown(("fuzzer", "what is changed", "streams"), rows, left=2)
 
 
-def stage_seconds() -> str:
-    """Return the seconds of the stages of a large synthetic scene and of a recording."""
-    profiles = committed("stages")["profiles"]
-    return stages.table({name: profiles[name] for name in ("n3dv, frame 3", "basketball, frame 7")})
-
-
 def trial_table(table: Callable[..., str]) -> str:
     """Return a table of the trial of branches."""
     return table(needed.rows_of(committed("what_is_needed")))
@@ -87,7 +80,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(
         committed("held_out")["fits"], committed("held_out_seeds")["fits"]
     ),
-    "stages": stage_seconds,
     **{
         f"trial_{name}": partial(trial_table, table)
         for name, table in (
