@@ -7,8 +7,9 @@ from functools import partial
 from typing import Any
 
 from benchmarks.pages.results import committed
-from benchmarks.reports import far_cameras, field, held_out, needed, starts
+from benchmarks.reports import far_cameras, field, held_out, needed, stability, starts
 from benchmarks.reports.plots import markdown
+from benchmarks.speed import host
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -80,6 +81,9 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(
         committed("held_out")["fits"], committed("held_out_seeds")["fits"]
     ),
+    "host": lambda: host.sizes_table(committed("host")["sizes"]),
+    "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
+    "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
     **{
         f"trial_{name}": partial(trial_table, table)
         for name, table in (

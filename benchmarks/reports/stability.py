@@ -2,7 +2,8 @@
 
     python -m benchmarks.reports.stability
 
-writes `benchmarks/results/stability.json`, which docs/experiments/stability.md quotes.
+writes `benchmarks/results/stability.json`; `python -m benchmarks.pages` writes the tables of
+docs/experiments/stability.md.
 
 The cases are shared with the tests (`tests.scenes.extremes`, `tests.scenes.hard_fits`). Image and
 gradients are compared with a reference in extended precision, a million Gaussians with
@@ -84,6 +85,18 @@ def stability_table(rows: Sequence[Row]) -> str:
             gradients = (row.get(name, 0) for row in group for name in ATTRIBUTES)
             lines.append((kind, f"{image:.0e}", f"{max(gradients):.0e}"))
     return markdown(("kind", "image", "gradients"), lines)
+
+
+def fits_table(rows: Sequence[Row]) -> str:
+    """Return the PSNR of the first and the last frame of each hard recording, and what is said."""
+    lines = []
+    for row in rows:
+        if row["kind"] == "fit":
+            first, last = row["psnr"]
+            sentence = row["sentence"].partition(";")[0] or "-"
+            lines.append((row["name"], str(row["frames"]), f"{first:.1f}", f"{last:.1f}", sentence))
+    columns = ("recording", "frames", "first, dB", "last, dB", "first status")
+    return markdown(columns, lines)
 
 
 if __name__ == "__main__":

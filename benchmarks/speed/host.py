@@ -215,6 +215,30 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown(("stage", *heads), lines)
 
 
+def sizes_table(sizes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the operations of each stage that has some, a size per column, and what the host
+    exchanges.
+    """
+    stages = [*dict.fromkeys(name for name, *_ in STAGES), "other", "total"]
+    lines = [
+        (
+            name,
+            *(
+                f"{rows[name]['operations']:.0f}" if name in rows else "-"
+                for rows in sizes.values()
+            ),
+        )
+        for name in stages
+        if any(rows.get(name, {}).get("operations") for rows in sizes.values())
+    ]
+    for count in ("recordings", "reads", "uploads", "stops"):
+        lines.append((count, *(f"{rows['total'][count]:.0f}" for rows in sizes.values())))
+    lines.append(
+        (FIRST_STEP, *(f"{rows[FIRST_STEP]['operations']:.0f}" for rows in sizes.values()))
+    )
+    return markdown(("", *sizes), lines)
+
+
 def plot(sizes: Mapping[str, Mapping[str, Any]]) -> Any:
     """Return the operations and the seconds of each stage, a column of plots per size."""
     image = blank_figure(4 * len(sizes), 5)

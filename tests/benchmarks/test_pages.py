@@ -13,7 +13,6 @@ from benchmarks.pages.plots import PLOTS
 from benchmarks.pages.results import RESULTS, committed
 from benchmarks.pages.tables import TABLES
 from benchmarks.reports.plots import grouped, span
-from benchmarks.reports.stability import ATTRIBUTES
 
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
 EVERYTHING = "\n".join(TEXTS.values())
@@ -161,13 +160,3 @@ captures: and {walk["bytes"]["per_residual"] / 1000:.0f} kB
     words = {name: " ".join(text.split()) for name, text in TEXTS.items()}
     pairs = [line.split(": ", 1) for line in quotes.strip().splitlines()]
     assert [quote for name, quote in pairs if quote not in words[name]] == []
-
-
-def test_stability_page__counts_the_kinds_with_small_errors():
-    rows = [row for row in committed("stability")["rows"] if "image" in row]
-    errors = {
-        kind: max(row.get(name, 0) for row in group for name in ("image", *ATTRIBUTES))
-        for (kind,), group in grouped(rows, "kind").items()
-    }
-    small = sum(error < 1.5e-5 for error in errors.values())
-    assert f"In {small} of {len(errors)} kinds" in TEXTS["stability"]
