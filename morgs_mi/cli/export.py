@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -32,13 +32,11 @@ from morgs_mi.cli.streams import (
     shown_exposure,
     with_first_camera,
 )
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.platform.checks import quantity
 from morgs_mi.platform.extras import extra, places
 from morgs_mi.platform.progress import Report
 from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
-
-if TYPE_CHECKING:
-    from morgs_mi.codec.frame_source import FrameSource
 
 
 @options

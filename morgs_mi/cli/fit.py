@@ -9,10 +9,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from tyro.conf import Positional
 
+from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cli.console import ERR, print_next, print_result, print_warning, progress
 from morgs_mi.cli.settings import (
     Flag,
@@ -25,14 +26,11 @@ from morgs_mi.cli.settings import (
     optional,
     options,
 )
+from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.platform.checks import quantity
 from morgs_mi.platform.config import config_toml
 from morgs_mi.platform.files import STREAM
-
-if TYPE_CHECKING:
-    from morgs_mi.capture.capture import Capture
-    from morgs_mi.loop.frame_report import FrameReport
-    from morgs_mi.loop.stream_config import StreamConfig
 
 
 @options
@@ -79,8 +77,6 @@ class Fit:
     }
 
     def run(self) -> None:
-        from morgs_mi.capture.capture import load_capture
-
         config = self.settings.stream_config()
         if self.print_config:
             print_result(config_toml(config).rstrip())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -20,13 +20,11 @@ from morgs_mi.cli.streams import (
     rendering,
     shown_exposure,
 )
+from morgs_mi.codec.frame_source import FrameSource
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.types import Arrays
 from morgs_mi.platform.checks import quantity
 from morgs_mi.playback.export.formats import IMAGES, SHEET, destination
-
-if TYPE_CHECKING:
-    from morgs_mi.codec.frame_source import FrameSource
-    from morgs_mi.core.camera import Camera
 
 _THUMBNAIL = 320  # pixels
 RenderedImages = Iterator[tuple[int, Arrays]]

@@ -6,18 +6,16 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import options
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.platform.progress import Report
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.formats import Format, destination
-
-if TYPE_CHECKING:
-    from morgs_mi.codec.frame_source import FrameSource
 
 _DROP = (
     "Leave out the Gaussians of a file whose numbers are not finite or absurdly large, however "
@@ -137,8 +135,9 @@ def relative_to(stream: FrameSource) -> str:
     """Return the origin of the centres in files of float32 in words, empty if it is 0."""
     from morgs_mi.playback.stream_header import stream_origin
 
-    x, y, z = stream_origin(stream)
-    return f", relative to the origin ({x:.10g}, {y:.10g}, {z:.10g})" if x or y or z else ""
+    origin = stream_origin(stream)
+    text = ", relative to the origin ({:.10g}, {:.10g}, {:.10g})".format(*origin)
+    return text if any(origin) else ""
 
 
 @options
