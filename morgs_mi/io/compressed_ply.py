@@ -24,27 +24,31 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from scipy.special import expit
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.core.types import Arrays
-from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
+from morgs_mi.io.ply import SH_DEGREES, columns_of, element, read_elements, rest_names
 from morgs_mi.platform.checks import few, require
 from morgs_mi.platform.files import atomic_path
 
 _CHUNK = 256
 _BOUNDS = {
-    key: [[f"{end}_{name}" for name in names] for end in ("min", "max")]
-    for key, names in {
-        "position": ("x", "y", "z"),
-        "scale": ("scale_x", "scale_y", "scale_z"),
-        "color": ("r", "g", "b"),
-    }.items()
+    "position": ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
+    "scale": (
+        "min_scale_x",
+        "min_scale_y",
+        "min_scale_z",
+        "max_scale_x",
+        "max_scale_y",
+        "max_scale_z",
+    ),
+    "color": ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b"),
 }
-_BOUND_NAMES = [name for ends in _BOUNDS.values() for names in ends for name in names]
+_BOUND_NAMES = (*_BOUNDS["position"], *_BOUNDS["scale"], *_BOUNDS["color"])
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ_BITS = (11, 10, 11)
 _ROTATION_BITS = (10, 10, 10)
@@ -72,32 +76,34 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
         "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
     }
-    chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in _BOUND_NAMES])
+    starts = np.arange(0, len(raw["means"]), _CHUNK)
+    bounds = []
     fractions = {}  # of the values between the bounds of their chunks
     for key, value in values.items():
-        value = value.astype(np.float32)
-        bounds = []
-        for names, bound in zip(_BOUNDS[key], (np.minimum, np.maximum), strict=True):
-            ends = bound.reduceat(value, np.arange(0, len(value), _CHUNK), axis=0)
-            for name, column in zip(names, ends.T, strict=True):
-                chunks[name] = column
-            bounds.append(_by_row(ends, len(value)))
-        low, high = bounds
+        value = value.astype("<f4")
+        least = np.minimum.reduceat(value, starts, axis=0)
+        most = np.maximum.reduceat(value, starts, axis=0)
+        bounds += [least, most]
+        low = _by_row(least, len(value))
+        high = _by_row(most, len(value))
         fractions[key] = (value - low) / np.where(high > low, high - low, 1)
     opacities = expit(raw["logit_opacities"].astype(np.float64))[:, None]
     colors = np.concatenate([fractions["color"], opacities], axis=1)
-    vertices = np.empty(len(colors), [(name, "<u4") for name in _PACKED])
-    vertices["packed_position"] = _packed(fractions["position"], _XYZ_BITS)
-    vertices["packed_rotation"] = _packed_rotations(unit_quats(gaussians))
-    vertices["packed_scale"] = _packed(fractions["scale"], _XYZ_BITS)
-    vertices["packed_color"] = _packed(colors, _COLOR_BITS)
-    elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertices, "vertex")]
+    words = (
+        _packed(fractions["position"], _XYZ_BITS),
+        _packed_rotations(unit_quats(gaussians)),
+        _packed(fractions["scale"], _XYZ_BITS),
+        _packed(colors, _COLOR_BITS),
+    )
+    elements = [
+        element("chunk", np.concatenate(bounds, axis=1), _BOUND_NAMES),
+        element("vertex", np.stack(words, axis=1), _PACKED),
+    ]
     if raw["sh_coeffs"].shape[1] > 1:
         names = rest_names(raw["sh_coeffs"].shape[1])
         rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(len(colors), len(names))
         steps = np.clip(np.floor((rest / (2 * _SH_RANGE) + 0.5) * 256), 0, 255).astype("u1")
-        rows = steps.view([(name, "u1") for name in names])[:, 0]
-        elements.append(PlyElement.describe(rows, "sh"))
+        elements.append(element("sh", steps, names))
     with atomic_path(path, "write_compressed_ply()") as partial:
         PlyData(elements, byte_order="<").write(str(partial))
 
@@ -142,8 +148,7 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
     coeffs = np.empty((N, K, 3), np.float32)
     coeffs[:, 0] = (base - 0.5) / SH_C0
     if rest:
-        steps = np.stack([rest[name] for name in rest_names(K)], axis=1)
-        steps = steps.reshape(N, 3, K - 1).transpose(0, 2, 1)
+        steps = columns_of(rest, rest_names(K)).reshape(N, 3, K - 1).transpose(0, 2, 1)
         parts = np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5))
         coeffs[:, 1:] = (parts / 128 - 1) * _SH_RANGE
     quats = _unpacked_rotations(vertices["packed_rotation"])
@@ -153,17 +158,15 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
 
 def _between(chunks: Arrays, key: str, fractions: np.ndarray) -> np.ndarray:
     """Return the values [N, 3] at fractions between the bounds of their chunks."""
-    low, high = (
-        _by_row(np.stack([chunks[name] for name in names], axis=1), len(fractions))
-        for names in _BOUNDS[key]
-    )
+    bounds = _by_row(columns_of(chunks, _BOUNDS[key]), len(fractions))
+    low, high = np.hsplit(bounds, 2)
     # NaN where a bound is infinite: the Gaussians of the chunk are invalid.
     with np.errstate(invalid="ignore"):
         return low * (1 - fractions) + high * fractions
 
 
 def _by_row(bounds: np.ndarray, N: int) -> np.ndarray:
-    """Return the bounds [N, 3] of each Gaussian's chunk, given the `bounds` [C, 3] of C chunks."""
+    """Return the bounds [N, k] of each Gaussian's chunk, given the `bounds` [C, k] of C chunks."""
     return bounds.astype(np.float64).repeat(_CHUNK, axis=0)[:N]
 
 

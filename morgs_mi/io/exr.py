@@ -150,12 +150,12 @@ def _check_size(path: str | Path) -> None:
     headers alone.
     """
     data = Path(path).read_bytes()
-    windows = [struct.unpack("<4i", window) for window in _WINDOW.findall(data)]
+    windows = np.frombuffer(b"".join(_WINDOW.findall(data)), "<i4").reshape(-1, 2, 2)
     if _DEEP.search(data):
         raise ValueError("it has deep pixels, which are not supported")
     if len(windows) < 2:
         raise ValueError("its header lacks dataWindow or displayWindow")
-    width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
+    width, height = (np.diff(windows.astype(np.int64), axis=1).max(axis=0) + 1).ravel().tolist()
     num_channels = 0
     for start in _CHANNELS.finditer(data):
         (size,) = struct.unpack("<I", start[1])

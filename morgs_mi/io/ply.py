@@ -86,10 +86,22 @@ def write_ply(
         columns[("opacity",)] = raw["logit_opacities"][:, None]
     columns |= {_SCALE: raw["log_scales"], _ROTATION: unit_quats(gaussians)}
     names = [name for names in columns for name in names]
-    table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
-    vertices = table.astype("<f4").view([(name, "<f4") for name in names])[:, 0]
+    table = np.concatenate([*columns.values()], axis=1, dtype="<f4", casting="same_kind")
     with atomic_path(path, "write_ply()") as partial:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
+        PlyData([element("vertex", table, names)], byte_order="<").write(str(partial))
+
+
+def element(name: str, table: np.ndarray, properties: Sequence[str]) -> PlyElement:
+    """Return the element of a PLY file that has the columns of a table as properties, in their
+    type.
+    """
+    rows = table.view([(column, table.dtype) for column in properties])[:, 0]
+    return PlyElement.describe(rows, name)
+
+
+def columns_of(properties: Arrays, names: Sequence[str]) -> np.ndarray:
+    """Return properties of an element of a PLY file as a table [N, names] in their type."""
+    return np.stack([properties[name] for name in names], axis=1)
 
 
 def read_ply(path: str | Path) -> Gaussians:
@@ -117,8 +129,7 @@ def read_ply(path: str | Path) -> Gaussians:
         for name, attribute in _MITSUBA.items():
             names = [f"{name}_{i}" for i in range(attribute.width)]
             if vertices.keys() >= {*names}:
-                values = np.stack([vertices[column] for column in names], axis=1)
-                values = values.reshape(len(values), *attribute.shape)
+                values = columns_of(vertices, names).reshape(-1, *attribute.shape)
                 attributes[attribute.name] = attribute.activation.inverse(values)
     else:
         vertices = as_3dgs(path, vertices)

@@ -32,7 +32,7 @@ from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, intrinsic_matrix, rigid
 from morgs_mi.io.clip_readers import Clip
 from morgs_mi.io.listing import existing_file
-from morgs_mi.io.ply import read_vertices
+from morgs_mi.io.ply import columns_of, read_vertices
 from morgs_mi.platform.bounded import JsonObject, read_json, warn_unread
 from morgs_mi.platform.checks import check_number, errors_at, few, numbers, require
 
@@ -42,6 +42,7 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 # Nerfstudio treats all of these as its single perspective model.
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _INTRINSICS = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
+_BANDS = ("red", "green", "blue")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _KEYS = {
     *_INTRINSICS,
@@ -175,10 +176,10 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(
             f"{path}: expected vertices x, y, z, got no {', '.join(missing)}; export it again."
         )
-    points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    if not {"red", "green", "blue"} <= vertices.keys():
+    points = columns_of(vertices, "xyz")
+    if not {*_BANDS} <= vertices.keys():
         return points, np.full(points.shape, 0.5, np.float32)
-    colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
+    colors = columns_of(vertices, _BANDS)
     scale = 255 if colors.dtype.kind in "iu" else 1
     return points, colors.astype(np.float32) / np.float32(scale)
 
