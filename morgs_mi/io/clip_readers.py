@@ -40,10 +40,12 @@ def open_clips(
     folders = {n: clip for n, clip in clips.items() if isinstance(clip, Path) and clip.is_dir()}
     aligned = aligned_folders(folders) if gaps else {}
     readers = {name: aligned.get(name) or open_frames(clip, gaps) for name, clip in clips.items()}
+    if white is not None:
+        return {name: replace(reader, white=white) for name, reader in readers.items()}
     largest = max(
         (reader.most for reader in readers.values() if reader.most is not None), default=WHITE
     )
-    if white is None and largest < WHITE // 4:
+    if largest < WHITE // 4:
         _LOG.warning(
             "%s and the other cameras: the first images have 16 bits but no value above %d and are "
             "nearly black; if white is less than %d, such as 4095 of cameras with 12 bits, set "
@@ -52,7 +54,7 @@ def open_clips(
             largest,
             WHITE,
         )
-    return {name: replace(reader, white=white or WHITE) for name, reader in readers.items()}
+    return readers
 
 
 def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:

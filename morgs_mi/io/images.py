@@ -20,6 +20,7 @@ from morgs_mi.io.exr import read_light
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
 from morgs_mi.io.numbering import check_counting, check_numbering, frame_numbers, natural_key
 from morgs_mi.platform.bounded import check_claim
+from morgs_mi.platform.checks import errors_at
 from morgs_mi.platform.png import has_whole_chunks
 
 WHITE = 2**16 - 1
@@ -89,8 +90,7 @@ class FolderReader(Frames):
         images = _images(path)
         files = list(images.values())
         numbers = list(images)
-        check_numbering(path, numbers, [file.name for file in files])
-        step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
+        step = check_numbering(path, numbers, [file.name for file in files])
         return replace(cls.of_files(files), numbers=range(numbers[0], numbers[-1] + step, step))
 
     @classmethod
@@ -102,10 +102,12 @@ class FolderReader(Frames):
             FileNotFoundError: a file is missing.
             ValueError: the first cannot be decoded.
         """
-        for file in () if gaps else files:
-            existing_file(file, *_IMAGE)
-        readable = (f for f in files if not (gaps and isinstance(_image_or_error(f), Exception)))
-        file = next(readable, files[0])
+        file = files[0]
+        if gaps:
+            file = next(filter(_is_readable, files), file)
+        else:
+            for each in files:
+                existing_file(each, *_IMAGE)
         first = _read_image(file)
         height, width = first.shape[:2]
         most = int(first.max()) if first.dtype == np.uint16 else None
@@ -131,25 +133,32 @@ class FolderReader(Frames):
         another size.
         """
         for index in indices:
-            if index >= self.num_frames:
-                yield ValueError(
-                    f"{self.path}: it has ended after {self.num_frames} images; record longer."
-                )
-                continue
-            file = self.files[index]
-            frame = _image_or_error(file)
-            if isinstance(frame, Exception):
-                yield frame
-            elif frame.shape[:2] != (self.height, self.width):
-                yield ValueError(
-                    f"{file}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
-                    f"{frame.shape[1]}x{frame.shape[0]}; extract the frames again."
-                )
-            else:
-                try:
-                    yield eight_bits(frame, self.white)
-                except ValueError as error:
-                    yield ValueError(f"{file}: {error}.")
+            try:
+                image = self._image(index)
+            except (ValueError, FileNotFoundError) as error:
+                image = error
+            yield image
+
+    def _image(self, index: int) -> np.ndarray:
+        """Return a frame.
+
+        Raises:
+            FileNotFoundError: it is missing.
+            ValueError: it is broken, of another size, or behind the last one.
+        """
+        if index >= self.num_frames:
+            raise ValueError(
+                f"{self.path}: it has ended after {self.num_frames} images; record longer."
+            )
+        file = self.files[index]
+        image = _read_image(file)
+        if image.shape[:2] != (self.height, self.width):
+            raise ValueError(
+                f"{file}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
+                f"{image.shape[1]}x{image.shape[0]}; extract the frames again."
+            )
+        with errors_at(file):
+            return eight_bits(image, self.white)
 
 
 def aligned_folders(folders: Mapping[str, Path]) -> dict[str, FolderReader]:
@@ -201,11 +210,12 @@ def _images(path: Path) -> dict[int, Path]:
     return dict(zip(frame_numbers(path, names), (images[name] for name in names), strict=True))
 
 
-def _image_or_error(file: Path) -> ImageOrError:
+def _is_readable(file: Path) -> bool:
     try:
-        return _read_image(file)
-    except (ValueError, FileNotFoundError) as error:
-        return error
+        _read_image(file)
+    except (ValueError, FileNotFoundError):
+        return False
+    return True
 
 
 def _read_image(file: Path) -> np.ndarray:
@@ -258,6 +268,6 @@ def eight_bits(image: np.ndarray, white: int) -> np.ndarray:
     if image.max() > white:
         raise ValueError(
             f"expected values up to the `white` of capture.json, {white}, got {image.max()}; "
-            "correct it"
+            "correct it."
         )
     return cv2.convertScaleAbs(image, alpha=255 / white)

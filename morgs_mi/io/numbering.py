@@ -51,8 +51,8 @@ def natural_key(name: str) -> list[str | int]:
     return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def check_numbering(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> None:
-    """Raise an error unless the numbers of a folder's frames are in equal steps.
+def check_numbering(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> int:
+    """Return the step of the numbers of a folder's frames, if it is always the same.
 
     Args:
         folder: the folder, for messages.
@@ -62,27 +62,28 @@ def check_numbering(folder: Path, numbers: Sequence[int], names: Sequence[str]) 
     Raises:
         ValueError: they are not; the sentence has the `names` before and behind the gap.
     """
-    check_counting(folder, numbers, names)
-    steps = np.diff(numbers)
-    if len(gaps := np.flatnonzero(steps > min(steps, default=1))):
+    step = check_counting(folder, numbers, names)
+    if len(gaps := np.flatnonzero(np.diff(numbers) > step)):
         raise ValueError(
             f"{folder}: the frames must be numbered without gaps, got {names[gaps[0]]} followed by "
             f"{names[gaps[0] + 1]}; extract them again, or go on without the missing ones (--gaps)."
         )
+    return step
 
 
-def check_counting(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> None:
-    """Raise an error unless the ascending numbers of a folder's frames count in multiples of their
-    smallest step, as times in milliseconds do not.
+def check_counting(folder: Path, numbers: Sequence[int], names: Sequence[str]) -> int:
+    """Return the smallest step of the ascending numbers of a folder's frames, if they count in
+    multiples of it, as times in milliseconds do not; 1 for a single number.
 
     Raises:
         ValueError: they do not.
     """
     steps = np.diff(numbers)
-    least = min(steps, default=1)
+    least = int(min(steps, default=1))
     if len(uneven := np.flatnonzero(steps % least)):
         raise ValueError(
             f"{folder}: expected numbers that count the frames in equal steps, got "
             f"{names[uneven[0]]} followed by {names[uneven[0] + 1]}, and steps of {least} between "
             "others; rename the images to 0000, 0001, ... if their names are times."
         )
+    return least

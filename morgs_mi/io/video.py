@@ -154,7 +154,7 @@ class VideoReader(Frames):
                 try:
                     image = self._image(frame, converter)
                 except ValueError as error:
-                    image = ValueError(f"{self.path}: frame {target}: {error}.")
+                    image = ValueError(f"{self.path}: frame {target}: {error}")
                 yield image
 
     def _image(self, frame: av.VideoFrame, converter: VideoReformatter) -> np.ndarray:
@@ -174,7 +174,7 @@ class VideoReader(Frames):
         if image.shape[:2] != (self.height, self.width):
             raise ValueError(
                 f"expected {self.width}x{self.height}, got {image.shape[1]}x{image.shape[0]}; "
-                "convert the clip to one size"
+                "convert the clip to one size."
             )
         return image
 
@@ -236,25 +236,29 @@ def _probe(path: Path) -> _Probe:
         num_indexed = len(stream.index_entries)
         hidden = sum(entry.is_discard for entry in stream.index_entries)
         first = None
-        packets = []
+        num_packets = 0
+        num_cut = 0
+        shown = []  # times of the packets that are neither hidden nor cut
         for packet in _unbroken(partial(container.demux, stream)):
             if first is None:
                 first = next(_unbroken(packet.decode), None)
-            if packet.size:
-                packets.append((packet.pts, packet.is_discard, packet.is_corrupt))
+            num_packets += packet.size > 0
+            num_cut += packet.is_corrupt
+            if packet.size and not (packet.is_discard or packet.is_corrupt):
+                shown.append(packet.pts)
         if first is None:
             raise _unreadable(path, "no frame can be decoded")
         with errors_at(path):
             height, width = _shown(np.empty((first.height, first.width)), first).shape
-        shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
         # Without stamps, if a packet has none, or two have the same.
         stamps = None
-        present = {time for time in shown if time is not None}
-        if first.pts is not None and len(present) == len(shown):
-            stamps = np.array(sorted(t for t in present if t >= first.pts), np.int64)
+        if first.pts is not None and None not in shown:
+            times = np.unique(np.array(shown, np.int64))
+            if len(times) == len(shown):
+                stamps = times[times >= first.pts]
         num_held = len(shown if stamps is None else stamps)
         num_frames = stream.frames - hidden if stream.frames else 0
-        if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
+        if num_indexed == num_packets and num_cut == 0:
             num_frames = num_held  # headers also count what edit lists and null frames hide
         # AVI stores decoding times alone.
         are_decoding_times = container.format.name == "avi" and stream.codec_context.has_b_frames
@@ -365,7 +369,7 @@ def _shown(image: np.ndarray, frame: av.VideoFrame) -> np.ndarray:
     if {abs(a), abs(b)} != {0, 1} or (abs(c), abs(d)) != (abs(b), abs(a)):
         raise ValueError(
             "expected a display matrix that mirrors or turns by 90, 180 or 270 degrees, got "
-            f"[{a:g} {b:g}; {c:g} {d:g}]; convert the clip"
+            f"[{a:g} {b:g}; {c:g} {d:g}]; convert the clip."
         )
     image = image if a else image.swapaxes(0, 1)
     return image[:: int(b + d), :: int(a + c)]

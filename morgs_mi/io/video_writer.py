@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from morgs_mi.platform.checks import require
+from morgs_mi.platform.checks import kind_of, require
 from morgs_mi.platform.files import atomic_folder, atomic_path
 from morgs_mi.platform.png import png_bytes
 
@@ -52,7 +52,13 @@ def write_video(
         OSError: the folder exists, or a file cannot be written.
     """
     path = Path(path)
-    frames = _checked(path, frames)
+    place = f"write_video({path})"
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError(f"{place}: at least one frame was expected, got none.")
+    height, width = first.shape[:2]
+    frames = _checked(place, chain([first], frames), (height, width, 3))
     if not path.suffix:
         with atomic_folder(path, "write_video()") as folder:
             for i, frame in enumerate(frames):
@@ -63,21 +69,26 @@ def write_video(
 
     require(
         codec in av.codecs_available,
-        f"write_video({path})",
+        place,
         f"expected PyAV with the encoder {codec}",
         "one without",
         "install its wheel (pip install --force-reinstall av), or write a folder of PNG files",
     )
+    require(
+        height % 2 == width % 2 == 0,  # 4:2:0 chroma has a number for 2x2 pixels
+        place,
+        "expected an even width and height of a video",
+        f"{width}x{height}",
+        "write images of another width, or a folder of PNG files",
+    )
+    require(
+        codec != H264 or max(height, width) <= _LONGEST_SIDE,
+        place,
+        f"expected at most {_LONGEST_SIDE} pixels across and down in H.264",
+        f"{width}x{height}",
+        "write smaller images, fewer channels or FILE.webm",
+    )
     with atomic_path(path, "write_video()", parents=True) as partial:
-        first = next(frames)
-        height, width = first.shape[:2]
-        require(
-            codec != H264 or max(height, width) <= _LONGEST_SIDE,
-            f"write_video({path})",
-            f"expected at most {_LONGEST_SIDE} pixels across and down in H.264",
-            f"{width}x{height}",
-            "write smaller images, fewer channels or FILE.webm",
-        )
         # Web pages play an .mp4 while it is loaded. A colon in the path would name a protocol.
         flags = {"movflags": "+faststart"}
         with av.open(f"file:{partial}", "w", container_options=flags) as container:
@@ -92,7 +103,7 @@ def write_video(
                 encoder = stream.codec_context
                 encoder.colorspace = encoder.color_primaries = encoder.color_trc = _BT709
                 encoder.color_range = _LIMITED
-            for frame in chain([first], frames):
+            for frame in frames:
                 rgb = av.VideoFrame.from_ndarray(frame, "rgb24")
                 container.mux(
                     stream.encode(
@@ -107,17 +118,15 @@ def write_video(
             container.mux(stream.encode())
 
 
-def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    shape = None
+def _checked(
+    place: str, frames: Iterable[np.ndarray], shape: tuple[int, int, int]
+) -> Iterator[np.ndarray]:
     for i, frame in enumerate(frames):
-        shape = shape or (*frame.shape[:2], 3)
-        # 4:2:0 chroma has a number for 2x2 pixels.
-        is_odd = path.suffix and (shape[0] % 2 or shape[1] % 2)
-        if frame.dtype != np.uint8 or frame.shape != shape or is_odd:
-            raise ValueError(
-                f"write_video({path}): frame {i} must be uint8 {[*shape]} like the first, in a "
-                f"video of even sizes, got {frame.dtype} {[*frame.shape]}; convert it first."
-            )
+        require(
+            frame.dtype == np.uint8 and frame.shape == shape,
+            place,
+            f"frame {i} must be uint8 {[*shape]} like the first",
+            kind_of(frame),
+            "convert it first",
+        )
         yield frame
-    if shape is None:
-        raise ValueError(f"write_video({path}): at least one frame was expected, got none.")
