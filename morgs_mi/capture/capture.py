@@ -290,8 +290,8 @@ class Capture:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """
-        stop = self.num_frames if stop is None else min(stop, self.num_frames)
-        return self.views[view].images(start, stop)
+        frames = range(self.num_frames)[start:stop]
+        return self.views[view].images(frames.start, frames.stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Return the cameras of a stream of this capture with the delays and readouts of the

@@ -152,8 +152,6 @@ def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     mask = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
-    if min(size) < 2:
-        return x, y, mask
     # A polynomial that was fitted to the recorded rays decreases again farther out, where it would
     # mirror the inner part of the image. Sampling every few pixels is accurate enough, and fast.
     step = max(1, min(x.shape) // 256)

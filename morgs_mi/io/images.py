@@ -18,7 +18,7 @@ import numpy as np
 
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, by_stem, existing_file, images_in
-from morgs_mi.io.numbering import check_counting, check_numbering, frame_numbers, natural_key
+from morgs_mi.io.numbering import check_counting, check_numbering, frames_by_number
 from morgs_mi.platform.bounded import check_claim
 from morgs_mi.platform.checks import errors_at
 from morgs_mi.platform.png import has_whole_chunks
@@ -88,10 +88,9 @@ class FolderReader(Frames):
         """
         path = Path(path)
         images = _images(path)
-        files = list(images.values())
-        numbers = list(images)
-        step = check_numbering(path, numbers, [file.name for file in files])
-        return replace(cls.of_files(files), numbers=range(numbers[0], numbers[-1] + step, step))
+        step = check_numbering(path, images)
+        numbers = range(min(images), max(images) + step, step)
+        return replace(cls.of_files([*images.values()]), numbers=numbers)
 
     @classmethod
     def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
@@ -172,7 +171,7 @@ def aligned_folders(folders: Mapping[str, Path]) -> dict[str, FolderReader]:
         return {}
     clips = {name: _images(folder) for name, folder in folders.items()}
     for name, files in clips.items():
-        check_counting(folders[name], [*files], [file.name for file in files.values()])
+        check_counting(folders[name], files)
     first = max(map(min, clips.values()))
     last = min(map(max, clips.values()))
     if first > last:
@@ -203,11 +202,10 @@ def aligned_folders(folders: Mapping[str, Path]) -> dict[str, FolderReader]:
 def _images(path: Path) -> dict[int, Path]:
     """Return a folder's images by their numbers, in natural order."""
     images = by_stem(images_in(path) if path.is_dir() else [])
-    names = sorted(images, key=natural_key)
-    if not names:
+    if not images:
         suffixes = ", ".join((*IMAGE_SUFFIXES, EXR_SUFFIX))
         raise FileNotFoundError(f"{path}: expected images ({suffixes}), found none; extract them.")
-    return dict(zip(frame_numbers(path, names), (images[name] for name in names), strict=True))
+    return frames_by_number(path, images)
 
 
 def _is_readable(file: Path) -> bool:

@@ -4,7 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.io.numbering import check_numbering, frame_numbers
+from morgs_mi.io.numbering import check_numbering, frames_by_number
+
+
+def files(names):
+    return {name: Path(f"{name}.png") for name in names}
 
 
 @pytest.mark.parametrize(
@@ -20,8 +24,10 @@ from morgs_mi.io.numbering import check_numbering, frame_numbers
         ([f"{10**20}_a1", f"{10**20 + 1}_a1"], [10**20, 10**20 + 1]),
     ],
 )
-def test_frame_numbers__are_those_that_change(names, numbers):
-    assert frame_numbers(Path("cam1"), names) == numbers
+def test_frames_by_number__are_those_that_change(names, numbers):
+    frames = frames_by_number(Path("cam1"), files(reversed(names)))
+    assert frames == dict(zip(numbers, files(names).values(), strict=True))
+    assert list(frames) == numbers
 
 
 @pytest.mark.parametrize(
@@ -36,9 +42,9 @@ def test_frame_numbers__are_those_that_change(names, numbers):
         (["0000", "b"], "a number in each name, got b; rename it"),
     ],
 )
-def test_frame_numbers__refuses_equal_numbers_another_order_and_none(names, message):
+def test_frames_by_number__refuses_equal_numbers_another_order_and_none(names, message):
     with pytest.raises(ValueError, match=f"^cam1: expected {message}"):
-        frame_numbers(Path("cam1"), names)
+        frames_by_number(Path("cam1"), files(names))
 
 
 @pytest.mark.parametrize(
@@ -57,5 +63,5 @@ def test_frame_numbers__refuses_equal_numbers_another_order_and_none(names, mess
 )
 def test_check_numbering__distinguishes_gaps_from_times(numbers, message):
     with pytest.raises(ValueError, match=message):
-        check_numbering(Path("cam1"), numbers, list(map(str, numbers)))
-    check_numbering(Path("cam1"), [4, 6, 8], ["4", "6", "8"])
+        check_numbering(Path("cam1"), {number: Path(str(number)) for number in numbers})
+    assert check_numbering(Path("cam1"), {number: Path(str(number)) for number in (4, 6, 8)}) == 2

@@ -27,8 +27,8 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import far_origin, scene_extent
 from morgs_mi.io.clip_readers import Clip
-from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
-from morgs_mi.io.numbering import frame_numbers, natural_key
+from morgs_mi.io.listing import VIDEO_SUFFIXES
+from morgs_mi.io.numbering import frames_by_number, natural_key
 from morgs_mi.platform.checks import few, require
 
 _LOG = logging.getLogger(__name__)
@@ -167,10 +167,8 @@ def calibration_files(path: Path, pattern: str) -> list[Path]:
     """Return the files with a name that matches a pattern in lower case, in a capture or in its
     `calibration`.
     """
-    folders = [folder for folder in (path, path / "calibration") if folder.is_dir()]
-    return [
-        file for folder in folders for file in listed(folder) if fnmatch(file.name.lower(), pattern)
-    ]
+    files = [*sorted(path.glob("[!.]*")), *sorted(path.glob("calibration/[!.]*"))]
+    return [file for file in files if fnmatch(file.name.lower(), pattern)]
 
 
 def only_calibration(
@@ -317,10 +315,9 @@ def _matched(source: Path, clips: Mapping[str, Clip], images: Sequence[Calibrate
         if name is None:
             match.without.append(image.name)
             continue
-        images_of_clip = match.images.setdefault(name, [image])
-        if images_of_clip[0] is not image:
-            _check_fixed(source, name, images_of_clip[0], image, origin)
-            images_of_clip.append(image)
+        images_of_clip = match.images.setdefault(name, [])
+        images_of_clip.append(image)
+        _check_fixed(source, name, images_of_clip[0], image, origin)
     return match
 
 
@@ -359,7 +356,7 @@ def _frames_of_cameras(source: Path, match: _Match) -> _Match:
     if len(photos_of) == len(match.images):
         return match
     cameras = {next(iter(files)): files for files in photos_of.values()}
-    numbers = {tuple(frame_numbers(source, [*files])) for files in cameras.values()}
+    numbers = {tuple(frames_by_number(source, files)) for files in cameras.values()}
     steps = np.diff(min(numbers))
     require(
         len(numbers) == 1 and (steps == np.abs(steps[:1])).all(),

@@ -30,7 +30,7 @@ from typing import TypeVar
 
 from morgs_mi.io.clip_readers import Clip, open_frames
 from morgs_mi.io.listing import VIDEO_SUFFIXES, by_stem, images_in, listed
-from morgs_mi.io.numbering import check_numbering, frame_numbers, natural_key
+from morgs_mi.io.numbering import check_numbering, frames_by_number, natural_key
 from morgs_mi.platform.checks import composed, few
 
 _LOG = logging.getLogger(__name__)
@@ -172,8 +172,8 @@ def check_frames(path: Path, clip: Sequence[Path]) -> None:
     Raises:
         ValueError: a number is missing or occurs twice.
     """
-    folders = [f.relative_to(path).parts[0] for f in clip]
-    check_numbering(path, frame_numbers(path, folders), folders)
+    folders = [path / f.relative_to(path).parts[0] for f in clip]
+    check_numbering(path, frames_by_number(path, {folder.name: folder for folder in folders}))
 
 
 def names_without(path: Path, names: Collection[str], without: Collection[str]) -> list[str]:
@@ -236,10 +236,9 @@ def size_of_clip(clip: Clip) -> tuple[int, int]:
     Raises:
         ValueError: it cannot be read.
     """
-    file = clip if isinstance(clip, Path) else clip[0]
-    if file.is_dir():
-        file = images_in(file)[0]
-    reader = open_frames(file if file.suffix.lower() in VIDEO_SUFFIXES else (file,))
+    if isinstance(clip, Path) and clip.is_dir():
+        clip = (images_in(clip)[0],)
+    reader = open_frames(clip, gaps=True)
     return reader.width, reader.height
 
 

@@ -71,9 +71,9 @@ def find_models(folder: Path) -> list[Path]:
     """
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
         numbered = sorted(place.glob("[0-9]*"), key=lambda model: natural_key(model.name))
-        models = [model for model in numbered if model.name.isdecimal() and _holds_model(model)]
-        if models or _holds_model(place):
-            return models or [place]
+        decimal = [model for model in numbered if model.name.isdecimal()]
+        if models := [*filter(_holds_model, (*decimal, place))]:
+            return models
     # In a capture itself, a single name may have another meaning.
     return [folder] if all(model_file(folder, name).exists() for name in _FILES) else []
 

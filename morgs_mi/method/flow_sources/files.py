@@ -25,7 +25,7 @@ import numpy as np
 
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.listing import listed
-from morgs_mi.io.numbering import frame_numbers
+from morgs_mi.io.numbering import frames_by_number
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
     FlowConfig,
@@ -114,9 +114,8 @@ def flow_files(folder: str, config: FlowConfig) -> FlowSource:
         place = Path(folder) / pair.camera / direction
         if frame not in numbered.get(place, {}):  # files may have been added since
             content = listed(place) if place.is_dir() else ()
-            paths = [path for path in content if path.suffix.lower() in _SUFFIXES]
-            numbers = frame_numbers(place, [path.stem for path in paths]) if paths else ()
-            numbered[place] = dict(zip(numbers, paths, strict=True))
+            paths = {path.name: path for path in content if path.suffix.lower() in _SUFFIXES}
+            numbered[place] = frames_by_number(place, paths) if paths else {}
         files = numbered[place]
         if frame not in files:
             content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"

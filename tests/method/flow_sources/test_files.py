@@ -132,7 +132,7 @@ def test_read_flow__rejects_channels_that_are_not_flow(tmp_path, names):
             ValueError,
             r"0001\.flo: expected 6x9 pixels as the images of cam00 have, got 9x6",
         ),
-        (pair_of("cam02"), ValueError, "one number .* got a_1 followed by b_1"),
+        (pair_of("cam02"), ValueError, "one number .* got a_1.exr followed by b_1.flo"),
         (pair_of("cam03"), OSError, "cannot read"),
     ],
 )
