@@ -215,6 +215,7 @@ class _Camera(Thread):
     def run(self) -> None:
         """Read until the source ends or the feed is closed."""
         number = 0
+        reason = "it has ended"
         try:
             for image in self._images:
                 if image is not None:
@@ -226,8 +227,9 @@ class _Camera(Thread):
                     break
         except Exception as error:
             self.error = error
+            reason = str(error)
         finally:
             close_items(self._images)
             with self._change:
-                self.reason = str(self.error or "it has ended")
+                self.reason = reason
                 self._change.notify_all()

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import mitsuba as mi
 import numpy as np
@@ -22,12 +22,10 @@ from morgs_mi.cli.settings import (
     options,
     setting,
 )
+from morgs_mi.extras.live.fit_live import LiveFrame, fit_live
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.platform.checks import quantity
-from morgs_mi.platform.files import STREAM
-
-if TYPE_CHECKING:
-    from morgs_mi.extras.live.fit_live import LiveFrame
+from morgs_mi.platform.files import PROVISIONAL, STREAM
 
 _PERIOD = 1.0  # least time between two lines about frames, s
 
@@ -66,9 +64,6 @@ class Live:
     settings: Annotated[LiveSettings, arg(name="")] = field(default_factory=LiveSettings)
 
     def run(self) -> None:
-        from morgs_mi.extras.live.fit_live import fit_live
-        from morgs_mi.platform.files import PROVISIONAL
-
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
         config = self.settings.stream_config(LIVE_STREAM)
         self.settings.check_methods(config)

@@ -95,8 +95,8 @@ def fit_live(
         FileNotFoundError: the capture with the calibration is missing.
         OSError: a source cannot be opened, or the output cannot be written; the stream ends with a
             complete frame.
-        ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be
-            calibrated or do not have the calibrated sizes.
+        ValueError: a setting is out of range, a video cannot be decoded, a camera has no first
+            image, or the cameras cannot be calibrated or do not have the calibrated sizes.
     """
     out = Path(out)
     live = config_or_default("fit_live()", live, LiveConfig(), "live")
@@ -126,8 +126,7 @@ def fit_live(
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
         report("Waiting for the cameras", 0, 1)
         first = feed.newest()
-        if first is None:
-            raise ValueError("fit_live(): expected images of the cameras, got none.")
+        assert first is not None
         report("Waiting for the cameras", 1, 1)
         capture = begin_capture(folder, first.images, live, calibration, on_stage)
         frames = _LiveFrames(feed, capture, first, live)
@@ -294,5 +293,6 @@ def _fit(
 def _record(frames: _LiveFrames, out: Path, frame_set: FrameSet, frame: PartialFrame) -> None:
     """Write the recorded images of a frame into the capture, which has the first frame's."""
     if frames.config.record and frame.index:
-        names = [view.name for view in frame.views if view.has_image]
-        write_images(out / "capture", {n: frame_set.images[n] for n in names}, frame.index)
+        recorded = frame_set.images
+        images = {view.name: recorded[view.name] for view in frame.views if view.has_image}
+        write_images(out / "capture", images, frame.index)

@@ -104,8 +104,8 @@ def live_frames(
 
     Raises:
         OSError: a source cannot be opened.
-        ValueError: the number of sources differs from the number of cameras, or an image from the
-            size of the rig's.
+        ValueError: a video cannot be decoded, the number of sources differs from the number of
+            cameras, or an image from the size of the rig's.
     """
     cameras = f"{quantity(len(rig.cameras), 'camera')} ({', '.join(rig.names)})"
     require(
@@ -184,6 +184,9 @@ def read_once(
     """
     if isinstance(source, int):
         stream = cv2.VideoCapture(source)
+        if size is not None:
+            stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
     else:
         # A connection is waited for only so long.
         limit = int(1000 * _SILENCE)
@@ -191,16 +194,16 @@ def read_once(
         stream = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, limits)
     if not stream.isOpened():
         raise OSError(f"cannot open the source {source}; check that it exists and is not in use.")
-    if isinstance(source, int) and size is not None:
-        stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-        stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
     failures = 0
     try:
         while failures < _FAILURES and not closed.is_set():
             is_read, image = stream.read()
-            failures = 0 if is_read else failures + 1
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
-            if not is_read:
+            if is_read:
+                failures = 0
+                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            else:
+                failures += 1
+                yield None
                 closed.wait(_PAUSE)
     finally:
         stream.release()
@@ -267,7 +270,7 @@ def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0) -> It
         clip: index of the video among the clips.
 
     Raises:
-        OSError: the video cannot be opened.
+        OSError, ValueError: as `VideoReader.open`.
     """
     try:
         for image, at, interval in timed_images(path):
@@ -284,12 +287,9 @@ def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
     and the interval between two images, s.
 
     Raises:
-        OSError: the video cannot be opened.
+        OSError, ValueError: as `VideoReader.open`.
     """
-    try:
-        reader = VideoReader.open(path)
-    except ValueError as error:
-        raise OSError(str(error)) from None
+    reader = VideoReader.open(path)
     interval = 1 / (reader.fps or _RATE)
     for index, image in enumerate(reader.pick(range(reader.num_held))):
         if isinstance(image, np.ndarray):

@@ -87,7 +87,7 @@ def test_Live__refuses_in_one_sentence(capture, tmp_path, run, args, part):
 )
 def test_Live__names_the_output_after_the_time(monkeypatch, settings, seconds, epochs):
     fit = Mock(side_effect=KeyboardInterrupt)
-    monkeypatch.setattr("morgs_mi.extras.live.fit_live.fit_live", fit)
+    monkeypatch.setattr("morgs_mi.extras.live.command.fit_live", fit)
     with pytest.raises(KeyboardInterrupt):
         Live(camera=("0", "rtsp://10.0.0.10/live"), settings=settings).run()
     sources, out, _, config, *_ = fit.call_args.args

@@ -82,7 +82,7 @@ def test_play__ends_when_it_is_closed(tmp_path):
 
 def test_play__refuses_what_has_no_image(tmp_path):
     (tmp_path / "text.mkv").write_text("no video")
-    with pytest.raises(OSError, match=r"text.mkv: expected a video, got 8 bytes"):
+    with pytest.raises(ValueError, match=r"text.mkv: expected a video, got 8 bytes"):
         next(play(tmp_path / "text.mkv", ClipClock(), Event()))
 
 
