@@ -223,19 +223,19 @@ DYNAMIC3DGS = {
     ),
     "fewer poses": (
         meta(lambda m: m["w2c"].pop()),
-        "as many cameras in every frame, got others after 3 frames .*argument 3 is shorter",
+        r"as many cameras in every frame, got the shapes \(4, 3\), \(4, 3\), \(3, 3\), ",
     ),
     "no frames": (
         meta(lambda m: m.update(fn=[])),
-        "expected lists of frames in .fn.*got others after 0 frames",
+        r"as many cameras in every frame, got the shapes \(4, 3\), \(0,\), ",
     ),
     "other camera": (
         meta(lambda m: m["cam_id"][1].__setitem__(0, 7)),
-        "after 2 frames .`cam_id` must name each camera of",
+        "`cam_id` must name each camera of .*, got another camera in frame 1",
     ),
     "long pose": (
         meta(lambda m: m["w2c"][1][0][0].__setitem__(0, 10**400)),
-        r"camera \d+: `w2c` must be an array of real numbers",
+        "train_meta.json: `w2c` must be an array of real numbers",
     ),
     "moving camera": (
         meta(moving),

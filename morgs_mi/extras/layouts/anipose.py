@@ -64,7 +64,7 @@ _HARMLESS = {
 _FOLDER = re.compile(r"^int_(.+)_img$")
 # Recognises a calibration without parsing it; a broken one is then reported as a broken
 # calibration.
-_MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=", re.MULTILINE) for key in ("matrix", "rotation")]
+_MARK = re.compile(r"^[ \t]*matrix[ \t]*=", re.MULTILINE)
 
 
 def read_anipose(path: Path) -> list[CalibratedImage]:
@@ -80,7 +80,7 @@ def read_anipose(path: Path) -> list[CalibratedImage]:
     entries = {
         key: table
         for key, table in tables.items()
-        if isinstance(table, dict) and any(k in table for k in _KEYS)
+        if isinstance(table, dict) and table.keys() & {*_KEYS}
     }
     ignored = [key for key, entry in entries.items() if entry.get("ignore")]
     require(
@@ -158,7 +158,7 @@ def _calibration_files(path: Path) -> list[Path]:
         except (OSError, ValueError):
             # Not readable, a folder or a pipe, or more than a calibration.
             continue
-        if all(mark.search(content) for mark in _MARKS):
+        if _MARK.search(content):
             files.append(file)
     return files
 

@@ -34,32 +34,42 @@ def read_meta(path: Path) -> dict[str, tuple[Camera, tuple[Path, ...]]]:
             camera moves.
     """
     meta = read_json(path)
-    missing = [key for key in _KEYS if not isinstance(meta, dict) or key not in meta]
+    keys = meta.keys() if isinstance(meta, dict) else set()
+    missing = ", ".join(sorted({*_KEYS} - keys))
     requirement = f"expected the keys {', '.join(_KEYS)}"
-    require(not missing, path, requirement, f"none of {', '.join(missing)}", "export again")
-    warn_unread(path, meta.keys() - set(_KEYS))
-    frames = []
-    try:
-        for entries in zip(*(meta[key] for key in ("cam_id", "k", "w2c", "fn")), strict=True):
-            rows = list(zip(*entries, strict=True))
-            frames.append({str(camera_id): row for camera_id, *row in rows})
-            if not rows or len(frames[-1]) < len(rows) or frames[-1].keys() != frames[0].keys():
-                raise ValueError("`cam_id` must name each camera of frame 0 once")
-        by_camera = {name: [frame[name] for frame in frames] for name in frames[0]}
-    except (TypeError, ValueError, LookupError) as error:
-        raise ValueError(
-            f"{path}: expected lists of frames in `fn`, `cam_id`, `k` and `w2c`, with as many "
-            f"cameras in every frame, got others after {len(frames)} frames ({error}); export it "
-            "again."
-        ) from None
+    require(not missing, path, requirement, f"none of {missing}", "export again")
+    warn_unread(path, keys - {*_KEYS})
+    ids = np.array(meta["cam_id"], object)
+    files = np.array(meta["fn"], object)
+    K = numbers(path, "k", meta["k"])
+    w2c = numbers(path, "w2c", meta["w2c"])
+    shapes = (ids.shape, files.shape, w2c.shape[:2], K.shape)
+    require(
+        shapes == (*[K.shape[:2]] * 3, (*K.shape[:2], 3, 3)),
+        path,
+        "`cam_id`, `fn`, `w2c` and `k` must have as many cameras in every frame",
+        "the shapes " + ", ".join(map(str, shapes)),
+        "export it again",
+    )
+    # The order of the cameras may change from frame to frame.
+    order = ids.astype(str).argsort(axis=1)
+    ids = np.take_along_axis(ids.astype(str), order, axis=1)
+    names = ids[0].tolist()
+    require(
+        (ids == ids[0]).all() and len({*names}) == len(names),
+        path,
+        "`cam_id` must name each camera of frame 0 once in every frame",
+        f"another camera in frame {(ids != ids[0]).any(axis=1).argmax()}",
+        "export it again",
+    )
+    files = np.take_along_axis(files, order, axis=1)
+    K = np.take_along_axis(K, order[..., None, None], axis=1)
+    w2c = np.take_along_axis(w2c, order[..., None, None], axis=1)
     cameras = {}
-    for name, rows in by_camera.items():
+    for index, name in enumerate(names):
         where = f"{path}, camera {name}"
-        Ks, poses, files = zip(*rows, strict=True)
-        K = numbers(where, "k", Ks, len(frames), 3, 3)
-        w2c = numbers(where, "w2c", poses)
-        viewmat = rigid(where, w2c[0])
-        for values, what in ((w2c, "pose"), (K, "intrinsics")):
+        viewmat = rigid(where, w2c[0, index])
+        for values, what in ((w2c[:, index], "pose"), (K[:, index], "intrinsics")):
             changes = np.abs(values - values[0]).max((1, 2))
             moving = ~(changes <= 1e-4 * (1 + np.abs(values[0]).max()))  # also where it is NaN
             requirement = f"the {what} in frame {moving.argmax()} must equal that in frame 0"
@@ -71,8 +81,9 @@ def read_meta(path: Path) -> dict[str, tuple[Camera, tuple[Path, ...]]]:
                 "use a recording of fixed cameras, as moving cameras are not supported",
             )
         with errors_at(where):
-            camera = Camera(K[0], viewmat, meta["w"], meta["h"], name=name)
-        cameras[name] = camera, tuple(path.parent / "ims" / str(file) for file in files)
+            camera = Camera(K[0, index], viewmat, meta["w"], meta["h"], name=name)
+        clip = tuple(path.parent / "ims" / str(file) for file in files[:, index])
+        cameras[name] = camera, clip
     return cameras
 
 
@@ -100,14 +111,14 @@ def _read_calibration(path: Path) -> Calibration:
     test = read_meta(path / "test_meta.json") if (path / "test_meta.json").is_file() else {}
     rig = read_meta(path / "train_meta.json") | test
     names = sorted(rig, key=natural_key)
-    empty = [name for name in names if not any(file.exists() for file in rig[name][1])]
-    if empty and len(empty) < len(rig):
+    present = [name for name in names if any(map(Path.exists, rig[name][1]))]
+    empty = sorted({*names} - {*present}, key=natural_key)
+    if empty and present:
         _LOG.warning("%s: no image of %s was found: left out.", path / "ims", ", ".join(empty))
-        names = [name for name in names if name not in empty]
+        names = present
     cloud = path / "init_pt_cld.npz"
     points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
-    pairs = (rig[name] for name in names)
-    views = tuple(CalibratedView(camera, clip=clip) for camera, clip in pairs)
+    views = tuple(CalibratedView(rig[name][0], clip=rig[name][1]) for name in names)
     held_out = tuple(name for name in names if name in test)
     return Calibration(views, points, colors, held_out or None, unused=tuple(empty))
 
