@@ -174,22 +174,24 @@ def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return fractions [N, k] rounded to integers of these numbers of bits, the first one in the
     highest bits.
     """
-    words = np.zeros(len(fractions), np.uint32)
-    for column, count in zip(fractions.T, bits, strict=True):
-        steps = np.floor(np.clip(column, 0, 1) * (2**count - 1) + 0.5)
-        words = words << np.uint32(count) | steps.astype(np.uint32)
-    return words
+    most = _most(bits).astype(fractions.dtype)
+    steps = np.floor(np.clip(fractions, 0, 1) * most + 0.5).astype(np.uint32)
+    return (steps << _shifts(bits)).sum(axis=1, dtype=np.uint32)
 
 
 def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return the fractions [N, k] of the lowest bits, the inverse of `_packed`."""
-    columns = []
-    rest = words.astype(np.uint32)
-    for count in reversed(bits):
-        most = 2**count - 1
-        columns.append((rest & np.uint32(most)) / most)
-        rest = rest >> np.uint32(count)
-    return np.stack(columns[::-1], axis=1)
+    return (words.astype(np.uint32)[:, None] >> _shifts(bits) & _most(bits)) / _most(bits)
+
+
+def _most(bits: tuple[int, ...]) -> np.ndarray:
+    """Return the largest integers of these numbers of bits."""
+    return (2 ** np.array(bits) - 1).astype(np.uint32)
+
+
+def _shifts(bits: tuple[int, ...]) -> np.ndarray:
+    """Return the places of integers of these numbers of bits, the last one in the lowest bits."""
+    return (sum(bits) - np.cumsum(bits)).astype(np.uint32)
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
