@@ -7,7 +7,6 @@ downscaled. Smaller images have fewer and less exact features.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +16,10 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.features import SharedFeatures, detect, match_views
 from morgs_mi.fit.image_points import matched_points
 from morgs_mi.fit.stereo import stereo_points
+from morgs_mi.platform.progress import StepReport, unreported
 
 
-def match_capture(
-    capture: Capture, progress: Callable[[int, int], None] | None = None
-) -> SharedFeatures:
+def match_capture(capture: Capture, progress: StepReport = unreported) -> SharedFeatures:
     """Return the features of the first frame, in pixels of the recorded size, and their matches.
 
     It takes about 0.6 s per view and 0.03 s per pair.
@@ -34,7 +32,6 @@ def match_capture(
     """
     capture = capture.displayed().at_recorded_size()
     views = next(capture.partial_frames(0, 1)).views
-    progress = progress or (lambda done, count: None)
     features = []
     for view in views:
         progress(len(features), len(views))

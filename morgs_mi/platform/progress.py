@@ -21,6 +21,10 @@ _WIDTH = 30
 _MEASURED = 0.03  # share of a stage after which its pace is known
 
 
+def unreported(*_: object) -> None:
+    """Report no progress."""
+
+
 def duration(seconds: float) -> str:
     """Return a time in words, such as ``30 s`` or ``4 min``."""
     for unit, length in (("h", 3600), ("min", 60)):

@@ -48,7 +48,7 @@ from morgs_mi.core.types import Arrays
 from morgs_mi.extras.exports.gltf_export import gltf_axes
 from morgs_mi.platform.checks import require
 from morgs_mi.platform.files import atomic_path
-from morgs_mi.platform.progress import StepReport
+from morgs_mi.platform.progress import StepReport, unreported
 from morgs_mi.playback.export.formats import USD, choose_format
 from morgs_mi.playback.stream_header import stream_origin
 
@@ -75,7 +75,7 @@ def write_usd(
     path: str | Path,
     frames: Sequence[int],
     half: bool = False,
-    progress: StepReport | None = None,
+    progress: StepReport = unreported,
 ) -> None:
     """Write frames of a stream as an OpenUSD stage; the file is written atomically. See the module
     for its content.
@@ -119,7 +119,7 @@ def _write_stage(
     path: Path,
     frames: Sequence[int],
     half: bool,
-    progress: StepReport | None,
+    progress: StepReport,
 ) -> None:
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
     axes = gltf_axes(stream.cameras)
@@ -169,8 +169,7 @@ def _write_stage(
         if unsaved_bytes > UNSAVED_BYTES and path.suffix.lower() != ".usda":
             stage.Save()
             unsaved_bytes = 0
-        if progress is not None:
-            progress(count, len(frames))
+        progress(count, len(frames))
     stage.Save()
 
 

@@ -9,10 +9,7 @@ from tyro.conf import Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_next, print_result, progress
-from morgs_mi.cli.settings import (
-    options,
-    setting,
-)
+from morgs_mi.cli.settings import options
 from morgs_mi.cli.streams import DropInvalid
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.platform.checks import quantity
@@ -36,9 +33,9 @@ class Import:
     """Frames per second."""
     axes: Annotated[Axes, arg(metavar="NAME")] = "y-down"
     """Direction that is up in the files: y-down, y-up or z-up."""
-    quality: Annotated[float | None, setting("quality")] = None
+    quality: Annotated[float, arg(metavar="FLOAT")] = CodecConfig().quality
     """Precision of the stream; 2 halves all errors."""
-    target_size: Annotated[int | None, setting("target_size")] = None
+    target_size: Annotated[int, arg(metavar="INT")] = CodecConfig().target_size
     """Most bytes of a frame that continues the one before; 0: no limit."""
     keyframe_interval: Annotated[int, arg(metavar="INT")] = CodecConfig().keyframe_interval
     """Frames between two keyframes; 0: only where they are needed."""
@@ -52,17 +49,17 @@ class Import:
                 "morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help."
             )
         *frames, out = self.paths
-        options = {
-            name: value
-            for name in ("quality", "target_size")
-            if (value := getattr(self, name)) is not None
-        }
+        config = CodecConfig(
+            quality=self.quality,
+            target_size=self.target_size,
+            keyframe_interval=self.keyframe_interval,
+        )
         with progress() as report:
             result = import_frames(
                 frames,
                 check_output(out),
                 self.fps,
-                CodecConfig(keyframe_interval=self.keyframe_interval, **options),
+                config,
                 self.axes,
                 lambda done, of: report("Importing", done, of),
                 most_invalid=1.0 if self.drop_invalid else 0.0,

@@ -27,13 +27,13 @@ from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.io.listing import listed
+from morgs_mi.io.listing import existing_file, listed
 from morgs_mi.io.numbering import natural_key
 from morgs_mi.io.splats import CONVERT, SUFFIXES, read_splats, suffix_of
 from morgs_mi.platform.checks import check_number, errors_at, require
 from morgs_mi.platform.config import config_or_default
 from morgs_mi.platform.files import STREAM, atomic_path
-from morgs_mi.platform.progress import StepReport
+from morgs_mi.platform.progress import StepReport, unreported
 from morgs_mi.playback.default_rig import BOX, DEFAULT_RIG, Axes, default_rig, scene_box
 from morgs_mi.runs.fit_files import due_keyframe
 
@@ -62,7 +62,7 @@ def import_frames(
     fps: float = 30.0,
     config: CodecConfig | None = None,
     axes: Axes = "y-down",
-    progress: StepReport | None = None,
+    progress: StepReport = unreported,
     most_invalid: float = 0.0,
 ) -> Imported:
     """Write files with Gaussians, one per frame, as a stream, and return a summary; the stream is
@@ -110,7 +110,6 @@ def import_frames(
         "config": {"codec": asdict(config)},
     }
     frames = (read_splats(source, most_invalid) for source in paths)
-    report = progress or (lambda *_: None)
     keyframes = 0
     with (
         atomic_path(path, "import_frames()") as partial,
@@ -120,7 +119,7 @@ def import_frames(
             keyframes += packets[0].kind == PacketKind.KEYFRAME
             for packet in packets:
                 writer.write(packet)
-            report(done, len(paths))
+            progress(done, len(paths))
     return Imported(path, len(paths), keyframes, path.stat().st_size)
 
 
@@ -163,13 +162,11 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
     """
     paths = [Path(source) for source in sources]
     place = paths[0] if paths else "import_frames()"
-    if missing := [path for path in paths if not path.exists()]:
-        raise FileNotFoundError(
-            f"{missing[0]}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
-        )
     if len(paths) == 1 and paths[0].is_dir():
         files = sorted(listed(paths[0]), key=lambda path: natural_key(path.name))
-        paths = [path for path in files if path.is_file() and suffix_of(path)]
+        paths = [path for path in files if suffix_of(path)]
+    for path in paths:
+        existing_file(path, f"one folder of frames, or files ({', '.join(SUFFIXES)})")
     kinds = f"files whose names end in {', '.join(SUFFIXES)}"
     require(paths, place, f"expected a folder with {kinds}", "none", CONVERT)
     first = {suffix_of(path): path for path in reversed(paths)}

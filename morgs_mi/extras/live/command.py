@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
@@ -24,6 +24,7 @@ from morgs_mi.cli.settings import (
 )
 from morgs_mi.extras.live.fit_live import LiveFrame, fit_live
 from morgs_mi.extras.live.live_config import LIVE_STREAM, LiveConfig
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.platform.checks import quantity
 from morgs_mi.platform.files import PROVISIONAL, STREAM
 
@@ -78,7 +79,7 @@ class Live:
                     is_shown = True
                     viewer.callback(stop_viewer, start_viewer(out, self.browser))
 
-            def on_frame(row: LiveFrame, *_: Any) -> None:
+            def on_frame(row: LiveFrame, _: FrameReport) -> None:
                 lines.add(row)
                 show()
 

@@ -37,7 +37,7 @@ from morgs_mi.platform.extras import extra
 from morgs_mi.platform.files import CAPTURE, atomic_path, locked_folder, write_json
 from morgs_mi.platform.interrupts import interrupts_raised
 from morgs_mi.platform.png import png_bytes
-from morgs_mi.platform.progress import Progress, Report
+from morgs_mi.platform.progress import Progress, Report, unreported
 from morgs_mi.platform.threads import in_background, map_in_threads
 from morgs_mi.playback.stream_header import about_lenses
 from morgs_mi.runs.fit_capture import Prepared, push_frame, with_border
@@ -71,8 +71,8 @@ def fit_live(
     out: str | Path,
     live: LiveConfig | None = None,
     config: StreamConfig | None = None,
-    on_frame: Callable[[LiveFrame, FrameReport], None] | None = None,
-    on_stage: Report | None = None,
+    on_frame: Callable[[LiveFrame, FrameReport], None] = unreported,
+    on_stage: Report = unreported,
 ) -> list[LiveFrame]:
     """Fit live cameras into OUT/stream.morgs until they end, or until Ctrl-C after the first frame.
 
@@ -122,15 +122,14 @@ def fit_live(
             _LOG.warning("%s: its masks are not used by a live fit.", source)
         calibration = calibration.without(source, live.without)
     names = calibration and calibration.names
-    report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
-        report("Waiting for the cameras", 0, 1)
+        on_stage("Waiting for the cameras", 0, 1)
         first = feed.newest()
         assert first is not None
-        report("Waiting for the cameras", 1, 1)
+        on_stage("Waiting for the cameras", 1, 1)
         capture = begin_capture(folder, first.images, live, calibration, on_stage)
         frames = _LiveFrames(feed, capture, first, live)
-        return _fit(frames, out, config, on_frame, report)
+        return _fit(frames, out, config, on_frame, on_stage)
 
 
 def begin_capture(
@@ -242,7 +241,7 @@ def _fit(
     frames: _LiveFrames,
     out: Path,
     config: StreamConfig,
-    on_frame: Callable[[LiveFrame, FrameReport], None] | None,
+    on_frame: Callable[[LiveFrame, FrameReport], None],
     on_stage: Report,
 ) -> list[LiveFrame]:
     """Fit live frames into a locked folder."""
@@ -278,8 +277,7 @@ def _fit(
                 live = [asdict(r) for r in (*rows, row)]
                 recording.push(packet, report, loop.state.coded, live=live)
                 rows.append(row)
-                if on_frame is not None:
-                    on_frame(row, report)
+                on_frame(row, report)
         except KeyboardInterrupt:
             if not rows:
                 raise

@@ -135,7 +135,7 @@ def test_find_frames__orders_by_number(tmp_path):
 @pytest.mark.parametrize(
     ("create", "selected", "message"),
     [
-        ([], ["missing"], "missing: expected frames .* found none; check the path"),
+        ([], ["missing"], "missing: expected one folder of frames, .* found none; check the path"),
         (
             ["a.txt"],
             ["."],
@@ -146,7 +146,7 @@ def test_find_frames__orders_by_number(tmp_path):
             ["."],
             "expected frames of one format, got a.splat and a.ply; name the files",
         ),
-        (["a.ply"], ["a.ply", "."], "expected one folder, or files whose names end in"),
+        (["a.ply"], ["a.ply", "."], "expected one folder of frames, or files .* found none"),
     ],
 )
 def test_find_frames__names_what_does_not_fit(tmp_path, create, selected, message):
