@@ -38,8 +38,7 @@ def used_in_clip(
         FileNotFoundError: a mask is missing.
         ValueError: a mask cannot be read or has another aspect ratio, or no pixel is left.
     """
-    opaque, note = opaque_pixels(reader, name)
-    notes = [note] if note else []
+    opaque, notes = opaque_pixels(reader, name)
     width = reader.width
     height = reader.height
     used_mask = np.ones((height, width), bool)
@@ -69,21 +68,21 @@ def used_in_clip(
     return None if used_mask.all() else used_mask, notes
 
 
-def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
-    """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and a note.
+def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, list[str]]:
+    """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and notes.
 
     The first, the middle and the last image are compared.
     """
     if not isinstance(reader, FolderReader):
-        return None, ""
+        return None, []
     indices = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
     shape = (reader.height, reader.width)
     mask, *others = (_opaque(reader.files[i], shape) for i in indices)
     if any(not np.array_equal(mask, other) for other in others):
-        return None, f"{name}: the alpha channel of its images changes over time and is ignored."
+        return None, [f"{name}: the alpha channel of its images changes over time and is ignored."]
     if mask.all():
-        return None, ""
-    return mask, f"{name}: {_unused(mask)} % of its pixels are transparent and masked out."
+        return None, []
+    return mask, [f"{name}: {_unused(mask)} % of its pixels are transparent and masked out."]
 
 
 def _unused(mask: np.ndarray) -> str:

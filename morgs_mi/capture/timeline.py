@@ -20,6 +20,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from sys import maxsize
 
 import numpy as np
 
@@ -137,6 +138,7 @@ def timeline(
             clip is cut off, the clips have no timestamp in common, or `config` names an unknown
             camera or has an offset that is not finite.
     """
+    most = max_frames or maxsize
     check_names(path, "offset", config.offset, [*readers])
     config = replace(config, offset={composed(name): o for name, o in config.offset.items()})
     exact, fps = _clocks(readers, config, fps)
@@ -146,11 +148,11 @@ def timeline(
     for note in notes:
         _LOG.warning("%s: %s", path, note)
     if config.trim or config.offset:
-        clocks = _without_drift(exact, max_frames)
-        timestamps = _common_timestamps(path, clocks, config, fps)[:max_frames]
+        clocks = _without_drift(exact, most)
+        timestamps = _common_timestamps(path, clocks, config, fps)[:most]
     else:
         clocks = {name: replace(clock, rate=1.0) for name, clock in exact.items()}
-        timestamps = np.arange(_num_frames(path, clocks, max_frames, config.gaps), dtype=float)
+        timestamps = np.arange(_num_frames(path, clocks, most, config.gaps), dtype=float)
         # Frames with the same index must be simultaneous.
         drift = np.ptp([clock.rate for clock in exact.values()]) * (len(timestamps) - 1)
         if drift > _NEAR:
@@ -285,7 +287,7 @@ def _spread(clips: Mapping[str, ClipTimes], clocks: _Clocks) -> float:
     return float(np.max(latest - earliest, initial=0))
 
 
-def _without_drift(clocks: _Clocks, max_frames: int | None) -> _Clocks:
+def _without_drift(clocks: _Clocks, most: int) -> _Clocks:
     """Return the clocks with a whole rate r for each clip that differs from it by less than half a
     frame in the end.
 
@@ -293,7 +295,7 @@ def _without_drift(clocks: _Clocks, max_frames: int | None) -> _Clocks:
     is then constant.
     """
     periods = min(clock.length / clock.rate for clock in clocks.values())
-    last = min(periods, max_frames or periods) - 1
+    last = min(periods, most) - 1
     steady = {}
     for name, clock in clocks.items():
         whole = max(1.0, np.rint(clock.rate))
@@ -336,15 +338,15 @@ def _check_complete(reader: FrameReader, required: int) -> None:
         )
 
 
-def _num_frames(path: Path, clocks: _Clocks, max_frames: int | None, gaps: bool) -> int:
-    """Return the number of timestamps of clips that are not aligned."""
+def _num_frames(path: Path, clocks: _Clocks, most: int, gaps: bool) -> int:
+    """Return the number of timestamps, up to `most`, of clips that are not aligned."""
     if gaps:
         longest = max(clock.length for clock in clocks.values())
-        return min(longest, max_frames or longest)
+        return min(longest, most)
     lengths = []
     for clock in clocks.values():
         reader = clock.reader
-        required = min(reader.num_frames, max_frames or reader.num_frames)
+        required = min(reader.num_frames, most)
         lengths.append(required)
         _check_complete(reader, required)
         if reader.positions is None:

@@ -21,14 +21,14 @@ def test_folder_reader__reads_every_format_and_upper_case(tmp_path, suffix):
         (tmp_path / f"{t}{suffix}").write_bytes(cv2.imencode(suffix.lower(), image)[1].tobytes())
     reader = FolderReader.open(tmp_path)
     assert [round(image.mean()) for image in reader.frames()] == [100, 101]
-    assert opaque_pixels(reader, "cam") == (None, "")
+    assert opaque_pixels(reader, "cam") == (None, [])
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".webp", ".png"])
 def test_folder_reader__masks_transparent_pixels_of_every_format(tmp_path, suffix):
     file = tmp_path / f"0{suffix}"
     file.write_bytes(cv2.imencode(suffix, RGBA)[1].tobytes())
-    mask, note = opaque_pixels(FolderReader.of_files([file]), "cam")
+    mask, (note,) = opaque_pixels(FolderReader.of_files([file]), "cam")
     assert "cam" in note
     assert_array_equal(mask, RGBA[..., 3] == 255)
 

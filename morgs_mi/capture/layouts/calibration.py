@@ -251,7 +251,7 @@ def match_clips(
         check_frames(path, first_clip)
     if match.without:
         _LOG.warning("%s: no clip is named after %s: left out.", source, few(match.without))
-    if extras := [name for name in match.clips if name not in match.images]:
+    if extras := sorted(match.clips.keys() - match.images.keys(), key=natural_key):
         _LOG.warning("%s does not calibrate %s: not used.", source, few(extras))
     unused = (*extras, *match.without)
     masks = _masks(path, match.images)

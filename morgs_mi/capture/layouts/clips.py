@@ -88,8 +88,9 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
         places = places[len(others) :]
     for place in places:
         inner = _clips(place)
-        if repeats := [name for name in inner if name in clips]:
-            first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, inner))
+        if repeats := sorted(inner.keys() & clips.keys()):
+            first = clips[repeats[0]].relative_to(path)
+            last = inner[repeats[0]].relative_to(path)
             _LOG.warning("%s: clips such as %s are used, not %s.", path, last, first)
         clips |= inner
     clips |= _clips(path)
@@ -154,7 +155,7 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
 
     The first frame determines the cameras; images that are missing in later frames are listed too.
     """
-    frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
+    frames = [*_in_order(_folders(path)).values()]
     if not frames:
         return {}
     images = _in_order(by_stem(images_in(frames[0])))

@@ -57,11 +57,6 @@ class ColmapModel:
     points: np.ndarray  #: [P, 3], world units; P = 0 if there are none.
     point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
 
-    @property
-    def cameras(self) -> tuple[Camera, ...]:
-        """The cameras of the images."""
-        return tuple(image.camera for image in self.images)
-
 
 def find_models(folder: Path) -> list[Path]:
     """Return the folders of the COLMAP models in a capture, of which the first is used.

@@ -43,12 +43,12 @@ def read_meta(path: Path) -> dict[str, tuple[Camera, tuple[Path, ...]]]:
     files = np.array(meta["fn"], object)
     K = numbers(path, "k", meta["k"])
     w2c = numbers(path, "w2c", meta["w2c"])
-    shapes = (ids.shape, files.shape, w2c.shape[:2], K.shape)
+    shape = K.shape[:2]  # frames, cameras
     require(
-        shapes == (*[K.shape[:2]] * 3, (*K.shape[:2], 3, 3)),
+        (ids.shape, files.shape, w2c.shape[:2], K.shape) == (shape, shape, shape, (*shape, 3, 3)),
         path,
         "`cam_id`, `fn`, `w2c` and `k` must have as many cameras in every frame",
-        "the shapes " + ", ".join(map(str, shapes)),
+        f"the shapes {ids.shape}, {files.shape}, {w2c.shape[:2]}, {K.shape}",
         "export it again",
     )
     # The order of the cameras may change from frame to frame.

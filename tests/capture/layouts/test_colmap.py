@@ -50,9 +50,9 @@ def as_binary(folder):
 @pytest.mark.parametrize("kind", ["txt", "bin"])
 def test_read_colmap__reads_what_write_colmap_writes(tmp_path, kind):
     model = read_colmap(write(tmp_path, kind))
-    order = np.argsort([camera.name for camera in model.cameras])
+    order = np.argsort([image.name for image in model.images])
     for i, expected, lens in zip(order, cameras(), LENSES, strict=True):
-        camera = model.cameras[i]
+        camera = model.images[i].camera
         assert camera.name == f"{expected.name}.png"
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         assert_allclose(camera.K, expected.K, rtol=1e-12)
@@ -67,7 +67,7 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path, kind):
 def test_read_colmap__projection_agrees_with_pycolmap(tmp_path):
     model = read_colmap(write(tmp_path))
     reference = pycolmap.Reconstruction(str(tmp_path))
-    camera = model.cameras[0]
+    camera = model.images[0].camera
     image = next(i for i in reference.images.values() if i.name == camera.name)
     for point in POINTS * 0.2:
         assert_close(camera.project(point)[0], image.project_point(point), atol=1e-9)

@@ -117,7 +117,7 @@ def test_calibrate__names_images_after_photos(tmp_path, names):
         )
         (tmp_path / f"._{name}").write_bytes(b"\0\5\x16\7")
     result = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
-    assert {camera.name for camera in read_colmap(result.model).cameras} == set(names)
+    assert {image.name for image in read_colmap(result.model).images} == set(names)
     assert load_capture(tmp_path).names == result.cameras
 
 

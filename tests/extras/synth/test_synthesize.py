@@ -30,10 +30,10 @@ def test_synthesize__writes_images_videos_truth_and_a_colmap_model(clip):
     assert (metadata["fps"], metadata["num_frames"], metadata["seed"]) == (30.0, 3, 0)
     expected = load_scene("arm").rig.cameras(3, 64, 48)
     model = read_colmap(clip / "sparse" / "0")
-    for ours, colmaps in zip(expected, model.cameras, strict=True):
-        assert_close(colmaps.viewmat, ours.viewmat, atol=1e-6)
-        assert_allclose(colmaps.K, ours.K)
-        assert colmaps.name == f"{ours.name}.png"
+    for ours, image in zip(expected, model.images, strict=True):
+        assert_close(image.camera.viewmat, ours.viewmat, atol=1e-6)
+        assert_allclose(image.camera.K, ours.K)
+        assert image.name == f"{ours.name}.png"
         assert open_frames(clip / f"{ours.name}.mp4").num_frames == 3
         assert len(list((clip / "frames" / ours.name).glob("*.png"))) == 3
         assert len(list((clip / "truth" / ours.name).glob("*.exr"))) == 3
