@@ -43,6 +43,7 @@ SETTINGS = {
     "exposure": "fit.exposure",
 }
 
+_DEFAULTS = StreamConfig()
 Options = TypeVar("Options")
 # Classes of options; `fill_help` reads the docstrings of their fields.
 _OPTIONS: list[Any] = []
@@ -105,11 +106,11 @@ def place(metavar: str) -> Any:
     return arg(metavar=f"[{metavar}]")
 
 
-def setting(option: str, config: StreamConfig | None = None, metavar: str = "") -> Any:
+def setting(option: str, config: StreamConfig = _DEFAULTS, metavar: str = "") -> Any:
     """Return the help of an option that is None where it is not given: the name of its value, by
     default its type, and the default.
     """
-    default = reduce(getattr, SETTINGS[option].split("."), config or StreamConfig())
+    default = reduce(getattr, SETTINGS[option].split("."), config)
     metavar = metavar or type(default).__name__.upper()
     return arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
@@ -215,18 +216,19 @@ class Settings:
 
     def given(self) -> dict[str, Any]:
         """Return the settings that were given as options, by key."""
-        values = {key: getattr(self, option) for option, key in SETTINGS.items()}
-        return {key: value for key, value in values.items() if value is not None}
+        return {
+            key: value
+            for option, key in SETTINGS.items()
+            if (value := getattr(self, option)) is not None
+        }
 
-    def stream_config(self, base: StreamConfig | None = None) -> StreamConfig:
-        """Return `base`, by default the default config, with the preset, the file and the given
-        options applied.
+    def stream_config(self, config: StreamConfig = _DEFAULTS) -> StreamConfig:
+        """Return a config with the preset, the file and the given options applied.
 
         Raises:
             FileNotFoundError: the file, or what a setting names, is missing.
             ValueError: a setting is unknown, of the wrong type or out of range.
         """
-        config = base or StreamConfig()
         if self.preset is not None:
             config = apply_preset(config, cast(PresetName, self.preset))
         if self.config is not None:

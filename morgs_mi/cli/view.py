@@ -5,7 +5,7 @@ from __future__ import annotations
 import webbrowser
 from pathlib import Path
 from typing import Annotated
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from tyro.conf import Positional, arg
 
@@ -44,7 +44,7 @@ class ViewStream:
         if name is not None:
             wishes.append(f"camera={quote(name)}")
         viewer = Viewer(stream, self.host, self.port, self.capture)
-        url = f"{viewer.url}#{'&'.join(wishes)}" if wishes else viewer.url
+        url = urlsplit(viewer.url)._replace(fragment="&".join(wishes)).geturl()
         print_result(f"{url} (Ctrl-C to stop)")
         print_view(stream, self.camera)
         if viewer.is_public:

@@ -57,7 +57,7 @@ class FlowNetwork:
             "export it with one input per image",
         )
         height, width = first[2:]
-        self._size = None if height is None or width is None else (width, height)
+        self._size = None if height is None else (width, height)
 
     def __call__(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the flow [H, W, 2] in pixels, float32, from `image` to `other` on the grid of
