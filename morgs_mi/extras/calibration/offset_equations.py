@@ -31,13 +31,14 @@ motion along the epipolar lines of two cameras.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
 from morgs_mi.core.gaussians import ActivatedGaussians, Gaussians
+from morgs_mi.core.view import View
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView, backproject
 from morgs_mi.render.rasterize import render_view
@@ -68,8 +69,13 @@ class OffsetEquations:
     train: np.ndarray  #: Mask of the training views, bool [V].
 
     def __add__(self, other: OffsetEquations) -> OffsetEquations:
-        names = ("matrix", "right", "scatter", "own")
-        return replace(self, **{n: getattr(self, n) + getattr(other, n) for n in names})
+        return OffsetEquations(
+            self.matrix + other.matrix,
+            self.right + other.right,
+            self.scatter + other.scatter,
+            self.own + other.own,
+            self.train,
+        )
 
     def solution(self, share: float = 1.0) -> np.ndarray:
         """Return o [V] in frames, with a mean of zero over the training views.
@@ -119,8 +125,7 @@ def _centred_inverse(matrix: np.ndarray, damping: float) -> np.ndarray:
 
 def offset_equations(
     gaussians: Gaussians,
-    views: Sequence[ActiveView],
-    targets: Sequence[Target],
+    views: Sequence[View],
     train: np.ndarray,
     blur: float,
 ) -> OffsetEquations:
@@ -128,8 +133,7 @@ def offset_equations(
 
     Args:
         gaussians: N Gaussians fitted to the timestamp, with their `motion` in one frame.
-        views: V views.
-        targets: their images, at about that timestamp.
+        views: V views with their images at about that timestamp.
         train: mask of the views that the Gaussians are fitted to, bool [V].
         blur: standard deviation in pixels of a Gaussian filter of errors and gradients. Offsets
             with displacements up to about this value can be found; 0: no filter.
@@ -137,15 +141,17 @@ def offset_equations(
     moving = (np.asarray(gaussians.motion) != 0).any(axis=1)
     d = np.asarray(gaussians.motion, np.float64)[moving]
     means = np.asarray(gaussians.means, np.float64)[moving]
-    products = []
-    for view, target in zip(views, targets, strict=True):
-        error = blurred(target.difference(render_view(gaussians, view).color), blur)
+    H = np.empty((len(views), *means.shape, 3))
+    b = np.empty((len(views), *means.shape))
+    for v, view in enumerate(views):
+        drawn = ActiveView(view.camera)
+        target = Target(view.image, view.mask)
+        error = blurred(target.difference(render_view(gaussians, drawn).color), blur)
         gradient = image_gradient(blurred(target.image(), blur))
-        products.append(gradient_products(gaussians, view, error, gradient))
-    A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))
-    J = np.stack([view.camera.projection_jacobian(means) for view in views])
-    H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
-    b = np.einsum("vkai,vka->vki", J, b)
+        products, error_products = gradient_products(gaussians, drawn, error, gradient)
+        J = view.camera.projection_jacobian(means)
+        H[v] = np.einsum("kai,kab,kbj->kij", J, products[moving], J)
+        b[v] = np.einsum("kai,ka->ki", J, error_products[moving])
     c = np.einsum("vkij,kj->vki", H, d)
     curvatures = H[train].sum(axis=0)
     prior = _PRIOR * np.trace(curvatures, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
@@ -182,9 +188,8 @@ def gradient_products(
     view: ActiveView,
     error: np.ndarray,
     gradient: tuple[np.ndarray, np.ndarray],
-    weight: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of w g g^T [N, 2, 2] and of w e g [N, 2] over the pixels and colours of a
+    """Return the sums of g g^T [N, 2, 2] and of e g [N, 2] over the pixels and colours of a
     view, per Gaussian.
 
     Args:
@@ -192,11 +197,8 @@ def gradient_products(
         view: the whole view.
         error: e [H, W, 3].
         gradient: g, the derivatives [H, W, 3] along x and y, per px.
-        weight: w [H, W], a further weight of the pixels.
     """
     x, y = gradient
-    sums = [
-        weight * np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))
-    ]
+    sums = [np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))]
     sums = backproject(gaussians, view, np.stack(sums, axis=-1)).astype(np.float64)
     return sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2), sums[:, 3:]

@@ -14,7 +14,7 @@ before. Points move with the cameras to keep their projections.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -126,10 +126,43 @@ def refine_cameras(
             scores.append(problem.score(estimate))
     calibrated, refined = scores
     is_better = tracks > 0 and not refined < calibrated + LEAST_GAIN
-    refinement = Refinement(
-        is_better, calibrated, refined, tracks, *_sizes(problem.cameras, changes)
-    )
+    sizes = _sizes(problem.changed_by(changes))
+    refinement = Refinement(is_better, calibrated, refined, tracks, *sizes)
     return problem.changed_capture(changes) if is_better else capture, refinement
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedView:
+    """A training view with the change of its camera."""
+
+    index: int  # of the view in the capture
+    calibrated: Camera  # calibrated camera at the size of the capture
+    visible: View  # reduced view without the withheld blocks
+    withheld: View  # these blocks
+    change: np.ndarray = field(default_factory=lambda: np.zeros(CHANGES))  # [11], see `bundle`
+
+    @property
+    def camera(self) -> Camera:
+        """The changed camera at the size of the capture."""
+        return changed_camera(self.calibrated, self.change)
+
+    @property
+    def lens(self) -> Lens:
+        """The distortion that is left in the images."""
+        return Lens("RADIAL", tuple(self.change[9:]))
+
+    def corrected(self, view: View) -> View:
+        """Return a reduced view with its changed camera, and without the distortion in its image
+        and mask.
+        """
+        view = replace(view, camera=changed_camera(view.camera, self.change))
+        correction = undistortion(view.camera, self.lens)
+        if correction is None:
+            return view
+        valid = correction.mask
+        if view.mask is not None:
+            valid = valid & (correction(view.mask.astype(np.float32)) > _VALID)
+        return replace(view, image=correction(view.image), mask=valid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +170,7 @@ class RefinementProblem:
     """Cameras to refine, and the images that evaluate them."""
 
     capture: Capture  # capture with the calibrated cameras
-    indices: tuple[int, ...]  # indices of the V training views with an image
-    views: tuple[View, ...]  # these views, reduced, without the withheld blocks
-    unseen: tuple[View, ...]  # their withheld blocks
+    views: tuple[RefinedView, ...]  # the V training views with an image, without changes
     extent: float  # scene extent, world units
     config: FitConfig  # settings of the fit
     render: RenderConfig  # cut-offs
@@ -150,8 +181,8 @@ class RefinementProblem:
         cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int
     ) -> RefinementProblem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
-        views = next(capture.displayed().partial_frames(0, 1)).views
-        train = {v: views[v] for v in capture.train_views if views[v].has_image}
+        images = next(capture.displayed().partial_frames(0, 1)).views
+        train = {v: images[v] for v in capture.train_views if images[v].has_image}
         require(
             len(train) > 1,
             "refine_cameras()",
@@ -161,24 +192,24 @@ class RefinementProblem:
         )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         visible, withheld = withheld_blocks(list(train.values()), config.short_fits.width, rng)
+        views = [
+            RefinedView(v, capture.cameras[v], visible[k], withheld[k]) for k, v in enumerate(train)
+        ]
         extent = scene_extent([view.camera for view in train.values()])
-        return cls(
-            capture, tuple(train), tuple(visible), tuple(withheld), extent, config, render, seed
-        )
+        return cls(capture, tuple(views), extent, config, render, seed)
 
-    @property
-    def cameras(self) -> list[Camera]:
-        """The calibrated cameras at the size of the capture."""
-        return [self.capture.cameras[v] for v in self.indices]
+    def changed_by(self, changes: np.ndarray) -> list[RefinedView]:
+        """Return the views with changes [V, 11] of their cameras."""
+        return [replace(v, change=change) for v, change in zip(self.views, changes, strict=True)]
 
     def matched(self) -> tuple[np.ndarray, int]:
         """Return the changes [V, 11] of the cameras by bundle adjustment, and the number of its
         points; without enough points, there are none, and no changes.
         """
         recording = self.capture.displayed().at_recorded_size()
-        cameras = [recording.cameras[v] for v in self.indices]
+        cameras = [recording.cameras[view.index] for view in self.views]
         images = next(recording.partial_frames(0, 1)).images
-        features = [detect(images[v], recording.masks[v]) for v in self.indices]
+        features = [detect(images[v.index], recording.masks[v.index]) for v in self.views]
         tracks = match_views(features, cameras).tracks()
         if np.bincount(tracks.views, minlength=len(cameras)).min() < _MIN_TRACKS:
             return np.zeros((len(cameras), CHANGES)), 0
@@ -188,27 +219,28 @@ class RefinementProblem:
 
     def score(self, changes: np.ndarray) -> float:
         """Return the PSNR of the withheld pixels, dB, after a fit with changed cameras."""
+        views = self.changed_by(changes)
         problem = FirstFrameProblem.of(
-            _changed(self.views, changes),
-            PointCloud(
-                _moved(self.capture.points, self.cameras, changes), self.capture.point_colors
-            ),
+            [view.corrected(view.visible) for view in views],
+            PointCloud(_moved(self.capture.points, views), self.capture.point_colors),
             self._short,
             self.render,
             rng_of(self.seed, Stream.REFINED_POINTS),
         )
         fit = fit_first_frame(problem, self._short, rng_of(self.seed, Stream.REFINEMENT))
-        return mean_psnr(fit.gaussians, _changed(self.unseen, changes), self.render)
+        withheld = [view.corrected(view.withheld) for view in views]
+        return mean_psnr(fit.gaussians, withheld, self.render)
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
         cameras = list(self.capture.cameras)
         distortions = np.zeros((len(cameras), 2))
-        for v, change in zip(self.indices, changes, strict=True):
-            cameras[v] = changed_camera(cameras[v], change)
-            distortions[v] = change[9:]
+        views = self.changed_by(changes)
+        for view in views:
+            cameras[view.index] = view.camera
+            distortions[view.index] = view.change[9:]
         rig = self.capture.with_cameras(cameras, distortions.tolist())
-        return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
+        return replace(rig, points=_moved(self.capture.points, views))
 
     @property
     def _short(self) -> FitConfig:
@@ -217,42 +249,32 @@ class RefinementProblem:
         return replace(short_fit_config(self.config), first_frame_steps=steps)
 
 
-def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
-    """Return views with changed cameras, and images and masks without the cameras' distortion."""
-    changed_views = []
-    for view, change in zip(views, changes, strict=True):
-        view = replace(view, camera=changed_camera(view.camera, change))
-        correction = undistortion(view.camera, Lens("RADIAL", tuple(change[9:])))
-        if correction is not None:
-            valid = correction.mask
-            if view.mask is not None:
-                valid = valid & (correction(view.mask.astype(np.float32)) > _VALID)
-            view = replace(view, image=correction(view.image), mask=valid)
-        changed_views.append(view)
-    return changed_views
-
-
-def _sizes(cameras: Sequence[Camera], changes: np.ndarray) -> list[float]:
+def _sizes(views: Sequence[RefinedView]) -> list[float]:
     """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by
     the lens.
     """
     shifts = []
-    for camera, change in zip(cameras, changes, strict=True):
+    for view in views:
+        camera = view.calibrated
         corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * camera.size
-        shifts.append((distorted(camera, corners, change[9:]) - corners) / camera.width)
+        shifts.append((distorted(camera, corners, view.change[9:]) - corners) / camera.width)
+    changes = np.array([view.change for view in views])
     vectors = (np.rad2deg(changes[:, :3]), changes[:, 3:6], changes[:, 6:7], np.concatenate(shifts))
     return [float(np.linalg.norm(each, axis=1).max()) for each in vectors]
 
 
-def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
+def _moved(points: np.ndarray, views: Sequence[RefinedView]) -> np.ndarray:
     """Return points [P, 3] moved to keep their projections in the views that show them, with
     changed cameras.
     """
-    rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
-    masks, pixels, _ = zip(*(seen_points(camera, points) for camera in cameras), strict=True)
-    lenses = (Lens("RADIAL", tuple(terms)) for terms in changes[:, 9:])
-    pixels = map(undistorted, rig, lenses, pixels)
-    views, ids = np.nonzero(masks)
-    intersections = intersect(ids, views, np.concatenate([*pixels]), rig, len(points))
+    rig = [view.camera for view in views]
+    masks = []
+    pixels = []
+    for view in views:
+        mask, seen, _ = seen_points(view.calibrated, points)
+        masks.append(mask)
+        pixels.append(undistorted(view.camera, view.lens, seen))
+    shown_by, ids = np.nonzero(masks)
+    intersections = intersect(ids, shown_by, np.concatenate(pixels), rig, len(points))
     is_determined = (np.sum(masks, axis=0) >= 2) & np.isfinite(intersections).all(axis=1)
     return np.where(is_determined[:, None], intersections, points).astype(np.float32)

@@ -28,7 +28,6 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
@@ -39,7 +38,6 @@ from morgs_mi.fit.initialise import FirstFrameProblem
 from morgs_mi.method.flow import ViewFlow, observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.lift import lift_flow
-from morgs_mi.method.ssim import Target
 from morgs_mi.platform.checks import require
 from morgs_mi.platform.progress import StepReport
 from morgs_mi.render.active_view import ActiveView
@@ -150,7 +148,7 @@ def estimate_time_offsets(
 
 def _aligned(clips: _Clips, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
     """Return offsets [V] of at most `largest`, the last step [V], and the step's equations."""
-    offsets = step = solution = np.zeros(len(clips.cameras))
+    offsets = step = solution = np.zeros(len(clips.clips))
     for index, blur in enumerate(_BLUR_OF_ROUND):
         equations = clips.equations(offsets, blur, largest)
         previous = solution
@@ -169,36 +167,50 @@ def _aligned(clips: _Clips, largest: int) -> tuple[np.ndarray, np.ndarray, Offse
     return offsets, step, equations
 
 
+@dataclass(frozen=True, eq=False)
+class _Clip:
+    """The first frames of a view, reduced."""
+
+    view: View  # the reduced view
+    images: list[np.ndarray]  # per frame, uint8 [H, W, 3]
+
+    @classmethod
+    def of(cls, capture: Capture, index: int) -> _Clip:
+        images = []
+        for image in capture.images(index, 0, _FRAMES):
+            if isinstance(image, Exception):
+                raise image
+            images.append(image)
+        view = View(capture.cameras[index], images[0], capture.masks[index]).reduced(_WIDTH)
+        size = view.camera.size
+        # The images are whole frames: with the capture's delays they would be displaced twice.
+        view = replace(view, camera=view.camera.without_delays())
+        return cls(view, [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images])
+
+    def at(self, time: float) -> View:
+        """Return the view with its image of a time, in frames."""
+        time = np.clip(time, 0, len(self.images) - 1)
+        frame = min(int(time), len(self.images) - 2)
+        share = time - frame
+        if share in (0, 1):
+            return self.view.at(self.images[frame + round(share)])
+        return self.view.at(image_between(self.images[frame], self.images[frame + 1], share))
+
+
 @dataclass(eq=False)
 class _Clips:
-    """The first frames of a capture, reduced, and fits to them."""
+    """The first frames of a capture, and fits to them."""
 
     capture: Capture
     progress: StepReport | None  # called with (fits done, fits at most), or None
-    cameras: tuple[Camera, ...]  # V views
-    masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
-    images: list[list[np.ndarray]]  # per view and frame uint8 [H, W, 3]
+    clips: tuple[_Clip, ...]  # of V views
     done: int = 0  # number of completed fits
 
     @classmethod
     def of(cls, capture: Capture, progress: StepReport | None) -> _Clips:
         display = capture.displayed()
-        cameras = []
-        masks = []
-        images = []
-        for index, camera in enumerate(capture.cameras):
-            clip = []
-            for image in display.images(index, 0, _FRAMES):
-                if isinstance(image, Exception):
-                    raise image
-                clip.append(image)
-            view = View(camera, clip[0], capture.masks[index]).reduced(_WIDTH)
-            size = view.camera.size
-            images.append([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in clip])
-            # The images are whole frames: with the capture's delays they would be displaced twice.
-            cameras.append(view.camera.without_delays())
-            masks.append(view.mask)
-        return cls(capture, progress, tuple(cameras), tuple(masks), images)
+        clips = tuple(_Clip.of(display, index) for index in range(len(capture.cameras)))
+        return cls(capture, progress, clips)
 
     @property
     def train(self) -> list[int]:
@@ -208,18 +220,11 @@ class _Clips:
     @property
     def num_frames(self) -> int:
         """Number of frames."""
-        return len(self.images[0])
+        return len(self.clips[0].images)
 
-    def at(self, times: np.ndarray) -> list[np.ndarray]:
-        """Return the image of each view at its own time [V], in frames."""
-        times = np.clip(times, 0, self.num_frames - 1)
-        first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
-        return [
-            clip[frame + round(share)]
-            if share in (0, 1)
-            else image_between(clip[frame], clip[frame + 1], share)
-            for clip, frame, share in zip(self.images, first, times - first, strict=True)
-        ]
+    def at(self, times: np.ndarray) -> list[View]:
+        """Return the views with their images, each at its own time [V], in frames."""
+        return [clip.at(time) for clip, time in zip(self.clips, times, strict=True)]
 
     def equations(self, offsets: np.ndarray, blur: float, largest: int) -> OffsetEquations:
         """Return the sum of the equations of all timestamps, with images interpolated by offsets
@@ -245,9 +250,12 @@ class _Clips:
 
     def _equations_at(self, times: np.ndarray, blur: float) -> OffsetEquations:
         """Return the equations of a timestamp, which each view shows at its own time [V]."""
-        images = self.at(times)
-        next_images = self.at(times + 1)
-        pairs = {v: FramePair(next_images[v], images[v], valid=self.masks[v]) for v in self.train}
+        views = self.at(times)
+        next_views = self.at(times + 1)
+        pairs = {
+            v: FramePair(next_views[v].image, views[v].image, valid=views[v].mask)
+            for v in self.train
+        }
         divisor = 2 if blur else 1
         fit = FitConfig(
             sh_degree=0,
@@ -256,15 +264,15 @@ class _Clips:
             dropout=0.0,
             density=DensityConfig(rounds=0),
         )
-        fit_views = [View(self.cameras[v], images[v], self.masks[v]) for v in self.train]
+        train_views = [views[v] for v in self.train]
         rng = rng_of(0, Stream.TIMING)
         points = PointCloud(self.capture.points, self.capture.point_colors)
-        problem = FirstFrameProblem.of(fit_views, points, fit, RenderConfig(), rng)
+        problem = FirstFrameProblem.of(train_views, points, fit, RenderConfig(), rng)
         gaussians = fit_first_frame(problem, fit, rng).gaussians
-        views = [ActiveView(camera) for camera in self.cameras]
         observed = observe_key_views(pairs)
-        flow = lift_flow(gaussians, [ViewFlow(views[v], observed[v]) for v in self.train])
+        flow = lift_flow(
+            gaussians, [ViewFlow(ActiveView(views[v].camera), observed[v]) for v in self.train]
+        )
         gaussians = replace(gaussians, motion=flow.displacement)
-        targets = list(map(Target, images, self.masks))
         train = np.isin(np.arange(len(views)), self.train)
-        return offset_equations(gaussians, views, targets, train, blur)
+        return offset_equations(gaussians, views, train, blur)

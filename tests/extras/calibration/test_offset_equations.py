@@ -7,9 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi import rasterize
+from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.offset_equations import offset_equations
-from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView
 from tests.scenes.ball import opaque_ball
 from tests.scenes.cameras import look_at_cameras
 
@@ -48,20 +47,18 @@ def equations(
     their places.
     """
     cameras = look_at_cameras(list(positions), 40)
-    targets = []
-    for view, (camera, offset) in enumerate(zip(cameras, offsets, strict=True)):
+    views = []
+    for index, (camera, offset) in enumerate(zip(cameras, offsets, strict=True)):
         moved_ball = replace(
             ball, means=np.asarray(ball.means) + np.float32(offset) * np.asarray(ball.motion)
         )
         image = np.asarray(rasterize(moved_ball, camera, ("color",)).color) + (
-            0 if noise is None else noise[view]
+            0 if noise is None else noise[index]
         )
-        targets.append(Target(np.clip(image, 0, 1).astype(np.float32)))
+        views.append(View(camera, np.clip(image, 0, 1).astype(np.float32)))
     displaced = replace(ball, means=(np.asarray(ball.means) + away).astype(np.float32))
     train = ~np.isin(np.arange(len(cameras)), held_out)
-    return offset_equations(
-        displaced, [ActiveView(camera) for camera in cameras], targets, train, 0.0
-    )
+    return offset_equations(displaced, views, train, 0.0)
 
 
 def test_solution__has_a_mean_of_zero_over_the_training_views():

@@ -76,7 +76,7 @@ def splat_capture(tmp_path_factory):
 def matched(monkeypatch):
     """Changes of cameras in place of those by features, which splats do not have."""
     monkeypatch.setattr(
-        RefinementProblem, "matched", lambda self: (wrong_changes(len(self.indices)), 100)
+        RefinementProblem, "matched", lambda self: (wrong_changes(len(self.views)), 100)
     )
 
 
