@@ -138,17 +138,15 @@ class Candidate:
 
 
 def import_pycolmap() -> Any:
-    """Return the module pycolmap, and restore the signal handlers of Ctrl-C and SIGTERM after its
-    import.
+    """Return the module pycolmap, and restore the signal handler of SIGTERM after its import.
 
     The logging library of pycolmap installs a handler for SIGTERM that prints a stack trace and
     aborts the process.
     """
     pycolmap = import_module("pycolmap")
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if (handler := signal.getsignal(number)) is not None:
-                signal.signal(number, handler)
+    handler = signal.getsignal(signal.SIGTERM)  # as set in Python
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
     return pycolmap
 
 

@@ -130,19 +130,21 @@ def estimate_time_offsets(
     part = (change[reference] - change) / np.where(moves != 0, moves, 1)
     part = np.clip(part, _LEAST_FOUND, 1)
     errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
-    settings = capture.reading.offset
+    given = capture.reading.offset
     clocks = offsets - [camera.delay for camera in capture.cameras]
-    options = {
-        name: round(float(settings.get(name, 0.0) - (clock - clocks[reference])), 3) + 0.0
-        for name, clock in zip(capture.names, clocks, strict=True)
-    }
-    change = float(np.abs(step).max())
+    offset_by_name = {}
+    error_by_name = {}
+    for view, name in enumerate(capture.names):
+        offset = given.get(name, 0.0) - (clocks[view] - clocks[reference])
+        offset_by_name[name] = round(float(offset), 3) + 0.0  # without -0
+        error_by_name[name] = round(float(errors[view]), 3)
+    last_change = float(np.abs(step).max())
     return TimeOffsets(
-        options,
-        dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True)),
+        offset_by_name,
+        error_by_name,
         capture.names[reference],
-        change,
-        change < _TOLERANCE,
+        last_change,
+        last_change < _TOLERANCE,
     )
 
 

@@ -7,7 +7,7 @@ that explains the matches. Pixels refer to the recorded size, as in `capture.poi
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -100,29 +100,30 @@ def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures
     pairs = _Pairs.of(shared, cameras)
     group = pairs.agreeing()
     checks = [_check(view, pairs, group) for view in range(len(cameras))]
-    errors = np.concatenate([np.zeros(0), *pairs.errors])
+    errors = pairs.errors
     # Of so few matches, a wrong correction explains enough by chance.
     has_many = 2 * len(errors) >= _MIN_MATCHES * len(checks)
     correction = _correct_rig(layout, pairs.sampled()) if has_many else None
     if correction:
         corrected = correction[0]
         # The views with another corrected camera are wrong.
-        views = range(len(cameras))
-        culprits = {view for view in views if corrected[view] is not pairs.cameras[view]}
-        checks = [_check(view, pairs, set(views) - culprits) for view in views]
+        culprits = {v for v in pairs.views if corrected[v] is not pairs.cameras[v]}
+        checks = [_check(view, pairs, pairs.views - culprits) for view in range(len(cameras))]
         for view in culprits:
             if checks[view].matches:
                 checks[view] = replace(checks[view], fits=False, advice="")
     wrong = ", ".join(check.name for check in checks if check.fits is False)
     not_checked = ", ".join(check.name for check in checks if check.fits is None)
+    fits = True
     advice = "the poses fit the images."
-    if correction:
-        advice = f"the poses do not fit the images: {correction[1]}."
-    elif wrong:
+    if wrong:
+        fits = False
         advice = f"the poses of {wrong} do not fit the images."
     elif not_checked:
+        fits = None
         advice = f"the poses of {not_checked} could not be checked."
-    fits = False if wrong else None if not_checked else True
+    if correction:
+        advice = f"the poses do not fit the images: {correction[1]}."
     return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
 
 
@@ -146,22 +147,42 @@ def pose_problems(views: Sequence[View]) -> list[str]:
 
 
 @dataclass(frozen=True)
+class _Pair:
+    """Two views with matches."""
+
+    match: Match  # the matches
+    errors: np.ndarray  # their reprojection errors [M], px
+
+
+@dataclass(frozen=True)
 class _Pairs:
     """Reprojection errors of all pairs of views with matches."""
 
     shared: SharedFeatures  # the matches
     cameras: tuple[Camera, ...]  # the poses
-    errors: tuple[np.ndarray, ...]  # per match of a pair [M], px
+    pairs: tuple[_Pair, ...]
 
     @classmethod
     def of(cls, shared: SharedFeatures, cameras: Sequence[Camera]) -> _Pairs:
-        errors = (shared.reprojection_errors(match, cameras) for match in shared.matches)
-        return cls(shared, tuple(cameras), tuple(errors))
+        pairs = (_Pair(m, shared.reprojection_errors(m, cameras)) for m in shared.matches)
+        return cls(shared, tuple(cameras), tuple(pairs))
 
-    def of_view(self, view: int, partners: Collection[int] | None = None) -> np.ndarray:
-        """Return the errors of a view's matches with `partners`, by default with all views, px."""
-        pairs = zip(self.shared.matches, self.errors, strict=True)
-        parts = [errors for match, errors in pairs if _is_shared(match, view, partners)]
+    @property
+    def views(self) -> set[int]:
+        """The indices of all views."""
+        return set(range(len(self.cameras)))
+
+    @property
+    def errors(self) -> np.ndarray:
+        """The errors of all matches, px."""
+        return np.concatenate([np.zeros(0), *(pair.errors for pair in self.pairs)])
+
+    def of_view(self, view: int, partners: set[int]) -> np.ndarray:
+        """Return the errors of a view's matches with `partners`, px."""
+        views = partners | {view}
+        parts = [
+            p.errors for p in self.pairs if view in p.match.views and views >= {*p.match.views}
+        ]
         return np.concatenate([np.zeros(0), *parts])
 
     def sampled(self, max_pairs: int | None = None) -> _Pairs:
@@ -174,7 +195,7 @@ class _Pairs:
 
     def worst(self) -> float:
         """Return the largest median error of a view, px; there must be matches."""
-        return float(np.nanmax([_median(self.of_view(view)) for view in range(len(self.cameras))]))
+        return float(np.nanmax([_median(self.of_view(view, self.views)) for view in self.views]))
 
     def agreeing(self) -> set[int]:
         """Return the views with mostly small errors in the matches between them.
@@ -193,22 +214,13 @@ class _Pairs:
         return group
 
 
-def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
-    """Return whether a match is between a view and one of its `partners`, which are all views if
-    None.
-    """
-    return view in match.views and (
-        partners is None or (set(match.views) - {view}) <= set(partners)
-    )
-
-
 def _median(errors: np.ndarray) -> float:
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
 def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     """Return the result of a view."""
-    all_errors = errors = pairs.of_view(view)
+    all_errors = errors = pairs.of_view(view, pairs.views)
     advice = ""
     if len(in_group := pairs.of_view(view, group)):
         errors = in_group
@@ -235,7 +247,7 @@ def _correct_rig(layout: str, pairs: _Pairs) -> tuple[Sequence[Camera], str] | N
     # The pairs with the most matches determine a factor on all focal lengths.
     largest = pairs.sampled(_FACTOR_PAIRS).shared
     candidates = focal_candidates(
-        pairs.cameras, lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors))
+        pairs.cameras, lambda cameras: _median(_Pairs.of(largest, cameras).errors)
     )
     if error > _GOOD_ERROR:
         candidates = [*rig_candidates(pairs.cameras, layout), *candidates]
