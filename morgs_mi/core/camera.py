@@ -83,8 +83,8 @@ class Camera:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
         check_size(where, self.width, self.height)
         check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
-        for name in ("delay", "readout"):
-            check_number(where, name, getattr(self, name), "[-1, 1]")
+        check_number(where, "delay", self.delay, "[-1, 1]")
+        check_number(where, "readout", self.readout, "[-1, 1]")
         K = numbers(where, "K", self.K, 3, 3).astype(np.float64)
         require(
             bounded(K) and min(K[0, 0], K[1, 1]) * LARGEST >= 1,  # so are their reciprocals
@@ -94,7 +94,7 @@ class Camera:
             "check the calibration",
         )
         require(
-            not (K[0, 1] or K[1, 0]) and np.array_equal(K[2], (0, 0, 1)),
+            np.array_equal(K, intrinsic_matrix(K[0, 0], K[1, 1], K[0, 2], K[1, 2])),
             where,
             "`K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
             K.tolist(),

@@ -134,12 +134,9 @@ def display_stops(images: Iterable[np.ndarray | None]) -> float:
 
     It is 0 without linear light above 1.
     """
-    brightest = [
-        image.max(axis=-1).ravel()
-        for image in images
-        if image is not None and image.dtype != np.uint8
-    ]
-    if not brightest or max(each.max() for each in brightest) <= 1:
+    light = [image for image in images if image is not None and image.dtype != np.uint8]
+    brightest = np.concatenate([np.zeros(0, np.float32), *(np.ravel(x.max(-1)) for x in light)])
+    if brightest.max(initial=0) <= 1:
         return 0.0
-    white = float(np.percentile(np.concatenate(brightest), _WHITE_PERCENTILE))
+    white = float(np.percentile(brightest, _WHITE_PERCENTILE))
     return -float(np.log2(white)) if white > 0 else 0.0

@@ -19,6 +19,7 @@ from morgs_mi.core.arrays import concatenated, float_tensor, from_numpy, rows_of
 from morgs_mi.core.attributes import (
     ATTRIBUTES,
     BY_ACTIVATED_NAME,
+    BY_NAME,
     EXP,
     SIGMOID,
     sigmoid,
@@ -234,13 +235,13 @@ class Gaussians:
         N = self.means.shape[0] if len(self.means.shape) else 0
         shapes = {a.name: [(N, *a.shape)] for a in ATTRIBUTES if a.activated_name != "sh_coeffs"}
         shapes["sh_coeffs"] = [(N, K, 3) for K in (1, 4, 9, 16)]
-        for name, allowed in shapes.items():
-            value = getattr(self, name)
+        for name, value in self.items().items():
+            shape = tuple(value.shape)
             require(
-                value is None or tuple(value.shape) in allowed,
+                shape in shapes[name],
                 "Gaussians()",
-                f"`{name}` must be {' or '.join(str(list(shape)) for shape in allowed)}",
-                () if value is None else list(value.shape),
+                f"`{name}` must be {' or '.join(str(list(allowed)) for allowed in shapes[name])}",
+                list(shape),
                 "all attributes describe the same Gaussians",
             )
 
@@ -345,9 +346,8 @@ class Gaussians:
         Raises:
             ValueError: one that all Gaussians have is missing, or as for `Gaussians`.
         """
-        names = [a.name for a in ATTRIBUTES]
         required = ("means", "log_scales", "quats", "logit_opacities", "sh_dc")
-        missing = [name for name in required if name not in parameters]
+        missing = sorted({*required} - parameters.keys())
         require(
             not missing,
             "Gaussians.from_parameters()",
@@ -355,7 +355,8 @@ class Gaussians:
             f"none of the name {', '.join(missing)}",
             "see Gaussians.parameters()",
         )
-        return cls(**_raw_attributes({n: parameters[n] for n in names if n in parameters}))
+        names = BY_NAME.keys() & parameters.keys()
+        return cls(**_raw_attributes({name: parameters[name] for name in names}))
 
     def with_parameters(self, parameters: Tensors) -> Gaussians:
         """Return these Gaussians with some of their `parameters` replaced.

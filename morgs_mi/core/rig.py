@@ -223,7 +223,7 @@ def _rig_depth(camera: Camera, focus: Focus, positions: np.ndarray) -> float:
         depth = float(distances.min(initial=np.inf))
     # Cameras at one place are apart by rounding errors.
     rounding = 1e-9 * np.abs(positions).max()
-    return depth if np.isfinite(depth) and depth > rounding else 0.0
+    return depth if rounding < depth < np.inf else 0.0
 
 
 def choose_key_views(

@@ -12,7 +12,7 @@ import json
 import operator
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import astuple, dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache
@@ -162,11 +162,9 @@ def _expected(value: object, kind: Any) -> str:
         length = "" if args[1] is ... else f" of {len(args)} items"
         if not isinstance(value, tuple) or (length and len(value) != len(args)):
             return f"a list{length}"
-        misfits = filter(None, (_expected(item, args[0]) for item in value))
-        return next((f"a list, each item {expected}" for expected in misfits), "")
+        return _first_misfit(value, args[0], "a list, each item")
     if origin is dict and isinstance(value, dict):
-        misfits = filter(None, (_expected(item, args[1]) for item in value.values()))
-        return next((f"a table, each value {expected}" for expected in misfits), "")
+        return _first_misfit(value.values(), args[1], "a table, each value")
     if origin is Literal:
         return "" if value in args else f"one of {', '.join(args)}"
     if kind in _NUMBERS:
@@ -175,6 +173,12 @@ def _expected(value: object, kind: Any) -> str:
     else:
         fits = isinstance(value, origin or kind)
     return "" if fits else _WORDS.get(kind, "a table")
+
+
+def _first_misfit(items: Iterable[object], kind: Any, words: str) -> str:
+    """Return words with the type of the first item that does not fit; empty if all fit."""
+    misfits = filter(None, (_expected(item, kind) for item in items))
+    return next((f"{words} {expected}" for expected in misfits), "")
 
 
 def apply_values(

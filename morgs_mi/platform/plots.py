@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from morgs_mi.platform.checks import require
 from morgs_mi.platform.files import atomic_path
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
@@ -22,11 +23,8 @@ def check_plot(path: Path) -> None:
         ValueError: the name has another suffix, or matplotlib is not installed.
     """
     suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise ValueError(
-            f"{path}: the suffix of a plot must be .png, .jpg, .svg or .pdf, got {suffix!r}; "
-            "rename it."
-        )
+    requirement = "the suffix of a plot must be .png, .jpg, .svg or .pdf"
+    require(suffix in _SUFFIXES, path, requirement, repr(suffix), "rename it")
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:
