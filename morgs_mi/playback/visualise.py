@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import byte_values
+from morgs_mi.platform.checks import require
 from morgs_mi.platform.files import FilePath, atomic_path
 from morgs_mi.platform.png import png_bytes
 
@@ -38,12 +39,14 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         ValueError: the image has another shape.
     """
     image = np.asarray(image)
-    image = image[..., None] if image.ndim == 2 else image
-    if image.ndim != 3 or image.shape[2] not in (1, 3):
-        raise ValueError(
-            f"to_uint8(): `image` must be [H, W], [H, W, 1] or [H, W, 3], got {image.shape}."
-        )
-    levels = byte_values(np.nan_to_num(image, posinf=0, neginf=0))
+    require(
+        image.ndim > 1 and image.shape[2:] in ((), (1,), (3,)),
+        "to_uint8()",
+        "`image` must be [H, W], [H, W, 1] or [H, W, 3]",
+        image.shape,
+        "pass one image",
+    )
+    levels = byte_values(np.nan_to_num(np.atleast_3d(image), posinf=0, neginf=0))
     return np.broadcast_to(levels, (*image.shape[:2], 3)).copy()
 
 
@@ -66,11 +69,13 @@ def motion_image(
         ValueError: `motion` is not [H, W, 2], or the scale is not positive.
     """
     motion = np.asarray(motion, np.float32)
-    if motion.ndim != 3 or motion.shape[2] != 2 or not scale_px > 0:
-        raise ValueError(
-            "motion_image(): `motion` must be [H, W, 2] and `scale_px` positive, got "
-            f"{motion.shape} and {scale_px}."
-        )
+    require(
+        motion.shape[2:] == (2,) and scale_px > 0,
+        "motion_image()",
+        "`motion` must be [H, W, 2] and `scale_px` positive",
+        f"{motion.shape} and {scale_px}",
+        "pass the motion of one image",
+    )
     valid = np.asarray(np.isfinite(motion).all(-1))
     x, y = np.moveaxis(np.where(valid[..., None], motion, 0), -1, 0)
     hue = np.rad2deg(np.arctan2(y, x)) % 360

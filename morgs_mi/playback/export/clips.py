@@ -16,10 +16,9 @@ from morgs_mi.core.types import Arrays
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
 from morgs_mi.platform.checks import check_number
-from morgs_mi.platform.files import atomic_folder, atomic_path
 from morgs_mi.platform.progress import StepReport
 from morgs_mi.playback.default_rig import DEFAULT_RIG
-from morgs_mi.playback.export.formats import Format
+from morgs_mi.playback.export.formats import Format, frame_files
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from morgs_mi.playback.player import available_channels, render
 from morgs_mi.playback.stream_header import render_config, stream_origin
@@ -134,17 +133,12 @@ def write_each(
         OSError: the folder exists, or a file cannot be written.
     """
     selection = set(frames)
-    is_file = Path(output).name.lower().endswith(suffix)
-    if is_file and len(selection) > 1:
-        raise ValueError(
-            f"{output}: expected one frame for one file, got {len(selection)}; select one "
-            "(--frames), or name a folder."
-        )
     # The clip is read up to the last of the frames.
     chosen = islice((frame for frame in clip if frame[0] in selection), len(selection))
-    with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
+    is_file = Path(output).name.lower().endswith(suffix)
+    with frame_files(output, is_file, suffix, "write_each()") as file_of:
         for count, (frame, gaussians) in enumerate(chosen, start=1):
-            write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
+            write(file_of(frame), gaussians)
             progress(count, len(selection))
 
 
@@ -170,8 +164,8 @@ def flight(
     """
     config = render_config(stream)
     frame_numbers(stream)  # refuses a stream without frames
-    frames = zip(range(num_images(stream, path)), clip or repeated_frames(stream), strict=False)
-    for i, gaussians in frames:
+    frames = islice(clip or repeated_frames(stream), num_images(stream, path))
+    for i, gaussians in enumerate(frames):
         camera = path.at(i / stream.fps)
         yield i, render(gaussians, camera, channels or available_channels(gaussians), config)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.platform.files import STREAM
+from morgs_mi.platform.checks import require
+from morgs_mi.platform.files import STREAM, atomic_folder, atomic_path
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,40 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
     )
 
 
+@contextmanager
+def frame_files(
+    output: str | Path, is_file: bool, suffix: str, place: str
+) -> Iterator[Callable[[int], Path]]:
+    """Write frames as ``0000.SUFFIX``, ``0001.SUFFIX``, ... into a new folder, or one frame as a
+    file; atomically. The context is the function that returns the path for a frame.
+
+    Args:
+        output: the folder or the file.
+        is_file: whether it is a file.
+        suffix: of the files in a folder, with its dot.
+        place: where an error's sentence begins.
+
+    Raises:
+        ValueError: several frames for one file.
+        OSError: the folder exists, or a file cannot be written.
+    """
+    frames: list[int] = []
+    with (atomic_path if is_file else atomic_folder)(output, place) as partial:
+
+        def file_of(frame: int) -> Path:
+            frames.append(frame)
+            require(
+                not is_file or len(frames) == 1,
+                output,
+                "expected one frame for one file",
+                "several",
+                "select one (--frames), or name a folder",
+            )
+            return partial if is_file else partial / f"{frame:04d}{suffix}"
+
+        yield file_of
+
+
 def destination(
     stream: Path,
     output: Path | None,
@@ -99,8 +135,9 @@ def destination(
     # Files of several scenes may lie in one folder.
     scene = "" if stream.name == STREAM else f"{stream.name.partition('.')[0]}-"
     path = check_output(output or stream.with_name(scene + choice.default.format(stem)))
-    if choice.is_file(path) and path.is_dir():
-        raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
-    if path.exists() and stream.exists() and path.samefile(stream):
-        raise ValueError(f"{path}: expected an output beside its source; choose another name.")
+    remedy = "choose another name"
+    is_writable = not (choice.is_file(path) and path.is_dir())
+    require(is_writable, path, "expected a file to write", "a folder", remedy)
+    is_source = path.exists() and stream.exists() and path.samefile(stream)
+    require(not is_source, path, "expected an output beside its source", "the source", remedy)
     return path, choice

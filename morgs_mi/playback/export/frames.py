@@ -11,9 +11,8 @@ from morgs_mi.core.color_space import decode_light, exposed
 from morgs_mi.core.types import Arrays
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import H264, VP9, write_video
-from morgs_mi.platform.files import atomic_folder, atomic_path
 from morgs_mi.platform.png import png_bytes
-from morgs_mi.playback.export.formats import IMAGES, choose_format
+from morgs_mi.playback.export.formats import IMAGES, choose_format, frame_files
 from morgs_mi.playback.player import explained_image
 from morgs_mi.playback.visualise import side_by_side, to_uint8, write_png
 from morgs_mi.render.channels import exr_names
@@ -72,14 +71,9 @@ def write_images(
         movie = (pad_to_even(_combined_image(images, shown)) for _, images in frames)
         write_video(output, movie, fps, _ENCODERS[kind])
         return
-    is_file = choice.is_file(output)
-    with (atomic_path if is_file else atomic_folder)(output, "write_images()") as partial:
-        for count, (frame, images) in enumerate(frames):
-            if is_file and count:
-                raise ValueError(
-                    f"{output}: expected one frame for one file, got several; name a folder."
-                )
-            path = partial if is_file else partial / f"{frame:04d}.{kind}"
+    with frame_files(output, choice.is_file(output), f".{kind}", "write_images()") as file_of:
+        for frame, images in frames:
+            path = file_of(frame)
             if kind == "exr":
                 write_exr(path, exr_channels(images))
             elif transparent:

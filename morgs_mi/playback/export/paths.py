@@ -27,7 +27,7 @@ from morgs_mi.core.camera import (
 from morgs_mi.core.rig import focus_point, positions_of, up_direction
 from morgs_mi.io.listing import existing_file
 from morgs_mi.platform.bounded import read_json
-from morgs_mi.platform.checks import check_number
+from morgs_mi.platform.checks import check_number, require
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -51,16 +51,17 @@ class CameraPath:
     def __post_init__(self) -> None:
         times = np.asarray(self.times, np.float64)
         object.__setattr__(self, "times", times)
-        sizes = {(key.width, key.height) for key in self.keys}
+        sizes = {key.size for key in self.keys}
         are_times = (
             times.shape == (len(self.keys),) and times[0] == 0 and np.all(np.diff(times) > 0)
         )
-        if len(self.keys) < 2 or len(sizes) > 1 or not are_times:
-            raise ValueError(
-                "CameraPath(): expected at least two key views of one size, with `times` that "
-                f"increase from 0, got {len(self.keys)} views of {sorted(sizes)} at "
-                f"{times.tolist()}."
-            )
+        require(
+            len(self.keys) > 1 and len(sizes) == 1 and are_times,
+            "CameraPath()",
+            "expected at least two key views of one size, with `times` that increase from 0",
+            f"{len(self.keys)} views of {sorted(sizes)} at {times.tolist()}",
+            "correct the keys",
+        )
 
     @property
     def seconds(self) -> float:

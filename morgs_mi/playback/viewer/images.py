@@ -75,8 +75,13 @@ class ExactImages:
         if self._decoded is None or self._decoded[0] != key:
             self._decoded = (key, stream.seek(frame).gaussians)
         gaussians = self._decoded[1]
-        if channel not in available_channels(gaussians):
-            raise ValueError(f"{stream.path}: expected a channel of the stream, got {channel!r}.")
+        require(
+            channel in available_channels(gaussians),
+            stream.path,
+            "expected a channel of the stream",
+            repr(channel),
+            "load the page again",
+        )
         return png_bytes(picture(stream, gaussians, camera, channel, motion_scale))
 
 
@@ -133,11 +138,13 @@ class RecordedImages:
                 the image was not recorded.
         """
         last = max(stream.frame_numbers(), default=-1)
-        if view >= len(stream.cameras) or frame > last:
-            raise ValueError(
-                f"{stream.path}: expected a camera and a frame of the stream, got {view} and "
-                f"{frame}."
-            )
+        require(
+            view < len(stream.cameras) and frame <= last,
+            stream.path,
+            "expected a camera and a frame of the stream",
+            f"{view} and {frame}",
+            "load the page again",
+        )
         with self._lock:
             # The capture of a live fit grows.
             if self._capture is None or frame >= self._capture.num_frames:

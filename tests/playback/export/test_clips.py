@@ -188,7 +188,7 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         ),
         (
             ("ply", "a.ply"),
-            "a.ply: expected one frame for one file, got 4; select one (--frames), or name a "
+            "a.ply: expected one frame for one file, got several; select one (--frames), or name a "
             "folder.",
         ),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
