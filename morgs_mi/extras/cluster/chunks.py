@@ -36,7 +36,7 @@ from morgs_mi.extras.cluster.tasks import (
 from morgs_mi.extras.cluster.workers import installed, num_workers
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.checks import quantity, require
 from morgs_mi.platform.files import locked_folder
 from morgs_mi.platform.interrupts import interrupts_raised
 from morgs_mi.platform.progress import Progress, Report
@@ -121,11 +121,14 @@ class ChunkedRun:
         self.progress = Progress(on_stage)
         num_frames = capture.num_frames
         most = max(1, num_frames // _MIN_FRAMES)
-        if not 1 <= chunks.count <= most:
-            raise ValueError(
-                f"ChunkedRun(): `chunks` must be 1 to {most} for "
-                f"{quantity(num_frames, 'frame')}, {_MIN_FRAMES} for each, got {chunks.count}."
-            )
+        require(
+            1 <= chunks.count <= most,
+            "ChunkedRun()",
+            f"`chunks` must be 1 to {most} for {quantity(num_frames, 'frame')}, {_MIN_FRAMES} for "
+            "each",
+            chunks.count,
+            "choose another number",
+        )
         # First frames of chunks of about the same length, and the number of frames.
         starts = np.linspace(0, num_frames, chunks.count + 1)
         self.starts: list[int] = starts.round().astype(int).tolist()
@@ -169,8 +172,9 @@ class ChunkedRun:
                 for start in self.starts[:-1]
                 for packet in StreamReader(self._files(start).stream)
             )
-            recordings = [self.recordings[start] for start in self.starts[:-1]]
-            reports = [report for recording in recordings for report in recording.reports]
+            reports = [
+                report for start in self.starts[:-1] for report in self.recordings[start].reports
+            ]
             with Recording(FitFiles.of(self.out), self.capture, self.metadata) as recording:
                 recording.extend(packets, reports, workers=self.peaks)
             _remove(folder)
@@ -232,9 +236,14 @@ class ChunkedRun:
         """Return the tasks of the next frames of chunks, if possible on a worker."""
         chunks = list(chunks)
         stops = [min(chunk.frame + TASK_FRAMES, chunk.stop) for chunk in chunks]
-        place = {} if worker is None else {"workers": worker, "allow_other_workers": True}
         return self.client.map(
-            fit_frames, len(chunks) * [self.task], chunks, stops, pure=False, **place
+            fit_frames,
+            len(chunks) * [self.task],
+            chunks,
+            stops,
+            pure=False,
+            workers=worker,
+            allow_other_workers=worker is not None,
         )
 
     def _use(self, capture: Capture) -> None:

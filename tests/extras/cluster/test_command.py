@@ -40,7 +40,7 @@ def test_fit__fits_chunks_side_by_side_and_names_what_stands_when_interrupted(
     assert not any(record.name.startswith("distributed") for record in caplog.records)
     assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
     assert main([*args[:-1], "3"]) == 1
-    assert "`chunks` must be 1 to 2 for 4 frames, 2 for each, got 3." in capsys.readouterr().err
+    assert "`chunks` must be 1 to 2 for 4 frames, 2 for each, got 3; " in capsys.readouterr().err
 
 
 def test_fit__refuses_no_chunks_before_it_reads_a_capture(capsys):
