@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,13 +63,14 @@ def draw_curves(axes: Any, result: SweepScores, first_alone: bool, name: str) ->
     means = mean_of(result.scores)
     points = np.stack([means.mean[:, INDEX[seconds]], means.mean[:, INDEX[name]]], 1)
     ends = []
-    for color, (label, rows) in zip(cycle(_COLORS), result.curves(first_alone).items()):
+    for k, (label, rows) in enumerate(result.curves(first_alone).items()):
+        color = _COLORS[k % len(_COLORS)]
         errors = means.error[rows][:, [INDEX[name], INDEX[seconds]]].T
         style = {"color": color, "marker": "o", "markersize": 4, "capsize": 2}
         axes.errorbar(*points[rows].T, *errors, **style)
-        for k in rows:
+        for row in rows:
             place = {"xytext": (0, 5), "textcoords": "offset points", "fontsize": 7}
-            axes.annotate(result.points[k], points[k], color=color, **place)
+            axes.annotate(result.points[row], points[row], color=color, **place)
         ends.append((label.replace(" and ", "\nand "), tuple(points[rows[-1]]), color))
     axes.set_xscale("log", subs=[2, 5])
     axes.xaxis.set_major_formatter("{x:g}")

@@ -39,6 +39,7 @@ from morgs_mi.extras.sweep.sweep_scores import SweepScores
 from morgs_mi.extras.sweep.vary import Vary
 from morgs_mi.loop.stream_config import PRESETS, PresetName, StreamConfig
 from morgs_mi.platform.bounded import JsonObject
+from morgs_mi.platform.checks import require
 from morgs_mi.platform.config import (
     Count,
     NonNegative,
@@ -191,8 +192,7 @@ def sweep(
         Arm(name, replace(config, fit=replace(config.fit, epochs=epochs)), epochs)
         for epochs, (name, config) in product(sorted({*vary.epochs}), configs.items())
     ]
-    if not arms:
-        raise ValueError("sweep(): expected a config and something to vary, got none; name some.")
+    require(arms, "sweep()", "expected a config and something to vary", "none", "name some")
     points = [(arm.first_alone, arm.point) for arm in arms]
     reference = np.array([points.index(point) for point in points], int)  # the first arm there
 
@@ -283,10 +283,9 @@ def leave_out(
     trial = _Trial(capture, config, tolerance, seeds, Path(out), stage, Fits.of(0, seeds))
     parts = [part for part in PARTS if _without([part], config) != config]
     result = trial.compare("all parts", [[part] for part in parts])
-    changes = result.changes.mean[1:, INDEX["psnr"]]
-    rows = zip(parts, result.reasons[1:], changes, strict=True)
+    changes = result.changes.mean[:, INDEX["psnr"]]
     # Parts that are not needed alone, with the change of the PSNR without each.
-    spare = {part: change for part, reason, change in rows if not reason}
+    spare = {part: changes[k] for k, part in enumerate(parts, 1) if not result.reasons[k]}
     while len(spare) > 1:
         # With all parts once more, so that seconds are of fits that ran in turn.
         result = trial.compare(f"all parts beside {len(spare)}", [list(spare)])
