@@ -15,6 +15,8 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
+from morgs_mi.capture.truth import GroundTruth
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.types import Arrays
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.metrics import psnr
@@ -169,14 +171,14 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: StepReport) -> No
 def _draw(out: Path, capture: Capture, report: StepReport) -> None:
     """Write the video and the contact sheet."""
     camera = capture.cameras[capture.reference_view]
-    truths = [truth_for_camera(capture, camera, frame) for frame in range(1, capture.num_frames)]
-    motions = [truth.motion[truth.mask] for truth in truths if truth is not None]
+    truths = [_truth(capture, camera, frame) for frame in range(1, capture.num_frames)]
+    motions = [truth.motion[truth.mask] for truth in truths]
     speeds = np.linalg.norm(np.concatenate([*motions, np.ones((1, 2))]), axis=1)
     scale = float(np.percentile(speeds, 95))  # px
     full = _panels(capture, out / "stream", scale)
     plain = _panels(capture, out / "stream_plain", scale, ", no ML, MO, MC")
     names = ("truth", "render", "motion", "confidence")
-    rows = [side_by_side([panels[name] for name in names if name in panels]) for panels in full]
+    rows = [side_by_side([panels[name] for name in names]) for panels in full]
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
     write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, H264)
     report(1, 2)
@@ -189,6 +191,13 @@ def _draw(out: Path, capture: Capture, report: StepReport) -> None:
     sheet.append(plain_panels)
     write_png(out / "contact_sheet.png", contact_sheet(sheet))
     report(2, 2)
+
+
+def _truth(capture: Capture, camera: Camera, frame: int) -> GroundTruth:
+    """Return the ground truth of a frame, which a synthetic capture has."""
+    truth = truth_for_camera(capture, camera, frame)
+    assert truth is not None
+    return truth
 
 
 def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> list[Arrays]:
@@ -209,13 +218,9 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
             "render": label(picture, f"render{note}, {psnr(picture, truth_image):.2f} dB"),
             "error": explained_image("error", abs(picture / 255 - truth_image / 255)),
         }
-        truth = truth_for_camera(capture, camera, index)
-        if truth is not None:
-            panels["true motion"] = explained_image(
-                "motion", truth.motion, scale, "true motion", truth_image
-            )
+        motion = _truth(capture, camera, index).motion
+        panels["true motion"] = explained_image("motion", motion, scale, "true motion", truth_image)
         for name in ("motion", "confidence"):
-            if name in images:
-                panels[name] = explained_image(name, images[name], scale, name + note, picture)
+            panels[name] = explained_image(name, images[name], scale, name + note, picture)
         frames.append(panels)
     return frames

@@ -132,7 +132,7 @@ class PathTracer:
         for name, (pose, transform) in self._lamps.items():
             self._params[name] = mi.Transform4f(pose(time) @ transform)
         self._params.update()
-        self._exposure = 1.0 if self.scene.exposure is None else self.scene.exposure(time)
+        self._exposure = self.scene.exposure(time)
 
     def render(self, camera: Camera, spp: int, seed: int, noise: float = 0.0) -> np.ndarray:
         """Return the path-traced view, sRGB-encoded [H, W, 3], uint8.

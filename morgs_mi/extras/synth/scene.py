@@ -99,6 +99,11 @@ class RecordingDefaults:
     noise: float = 0.0  #: Standard deviation of the sensor noise, relative to white.
 
 
+def constant_exposure(time: float) -> float:
+    """Return the exposure factor 1 at every time."""
+    return 1.0
+
+
 @dataclass(frozen=True)
 class Scene:
     """A moving scene."""
@@ -108,8 +113,8 @@ class Scene:
     objects: Mapping[str, Object]
     lights: Mapping[str, Light]  #: Lamps by name.
     rig: Rig = field(default_factory=Rig)  #: Positions of the cameras.
-    #: Seconds -> exposure factor of all cameras; None for 1.
-    exposure: Callable[[float], float] | None = None
+    #: Seconds -> exposure factor of all cameras.
+    exposure: Callable[[float], float] = constant_exposure
     #: Number of cameras and noise.
     recording: RecordingDefaults = field(default_factory=RecordingDefaults)
 
@@ -130,10 +135,13 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         paths = (Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py"))
     files = {path.stem: path for path in paths}
     path = files.get(str(scene), Path(scene))
-    if path.suffix != ".py" or not path.is_file():
-        raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)}, or a .py file."
-        )
+    require(
+        path.suffix == ".py" and path.is_file(),
+        "load_scene()",
+        "expected a scene",
+        repr(str(scene)),
+        f"name one of {sorted(files)}, or a .py file",
+    )
     build = build_of(path, "build(seed) -> Scene")
     with failures_in(path):
         result = build(seed)

@@ -15,8 +15,7 @@ Material = SceneDict
 
 def ball(radius: float, material: Material, center: Sequence[float] = (0, 0, 0)) -> SceneDict:
     """Return a sphere."""
-    placement = {} if tuple(center) == (0, 0, 0) else {"center": list(center)}
-    return {"type": "sphere", **placement, "radius": radius, "bsdf": material}
+    return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": material}
 
 
 def box(center: Sequence[float], half: Sequence[float], material: Material) -> SceneDict:

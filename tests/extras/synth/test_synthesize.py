@@ -110,7 +110,8 @@ def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
 
 def test_synthesize__names_the_scenes(tmp_path):
     with pytest.raises(
-        ValueError, match=r"no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'"
+        ValueError,
+        match=r"expected a scene, got 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'",
     ):
         synthesize("nowhere", tmp_path / "clip")
 
