@@ -124,17 +124,16 @@ class Candidate:
         return float(self.model.compute_mean_reprojection_error())
 
     @property
-    def complete(self) -> bool:
-        """Whether every camera has a pose."""
-        return all(check.fits is not None for check in self.checks)
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the cameras without a pose."""
+        return tuple(check.name for check in self.checks if check.fits is None)
 
     @property
     def rank(self) -> tuple[int, int, float]:
-        """Number of cameras that fit, number of cameras with a pose, and the negative error; larger
-        is better.
+        """Number of cameras that fit, negative number of cameras without a pose, and the negative
+        error; larger is better.
         """
-        fits = [check.fits for check in self.checks]
-        return fits.count(True), len(fits) - fits.count(None), -self.error
+        return sum(check.fits is True for check in self.checks), -len(self.left_out), -self.error
 
 
 def import_pycolmap() -> Any:
@@ -196,7 +195,7 @@ def calibrate(
         result = CalibrationResult(
             path / "sparse" / "0",
             tuple(check.name for check in best.checks if check.fits is not None),
-            tuple(check.name for check in best.checks if check.fits is None),
+            best.left_out,
             best.model.num_points3D(),
             best.error,
             best.checks,
@@ -310,13 +309,15 @@ def _frames(path: Path, config: CalibrateConfig, without: Sequence[str]) -> tupl
             "another one (--frame)."
         )
     frames = {}
+    masks = {}
     for name, reader in readers.items():
         position = int(nearest_frames(reader, np.array([config.frame]))[0])
         frames[name] = next(reader.frames(position, position + 1))
+        mask, *_ = opaque_pixels(reader, name)
+        if mask is not None:
+            masks[name] = mask
     stops = display_stops(frames.values())
-    images = {name: display_image(image, stops) for name, image in frames.items()}
-    masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
-    return images, {name: mask for name, mask in masks.items() if mask is not None}
+    return {name: display_image(image, stops) for name, image in frames.items()}, masks
 
 
 def match_views(
@@ -371,12 +372,14 @@ def match_views(
     with closing(pycolmap.Database.open(database)) as db:
         views = {Path(i.name).stem: i.image_id for i in db.read_all_images()}
         counts = {name: db.num_keypoints_for_image(view) for name, view in views.items()}
-    if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
-        table = ", ".join(f"{count} in {name}" for name, count in poor.items())
-        raise ValueError(
-            f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too "
-            f"dark, blurred or uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
-        )
+    poor = [f"{count} in {name}" for name, count in counts.items() if count < _MIN_FEATURES]
+    require(
+        not poor,
+        path,
+        f"expected at least {_MIN_FEATURES} features in every view",
+        f"{', '.join(poor)}: too dark, blurred or uniform",
+        f"{_MORE_TEXTURE}, or calibrate on another frame (--frame)",
+    )
     report("Matching views", 0, 1)
     # Without a seed of its own, the verification keeps other matches on each run, and may lose a
     # view with few of them.
@@ -416,7 +419,7 @@ def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Can
     pycolmap = import_pycolmap()
 
     candidates = _mapped(names, scratch, seed)
-    if not any(candidate.complete for candidate in candidates):
+    if all(candidate.left_out for candidate in candidates):
         pycolmap.calibrate_view_graph(
             scratch / _DATABASE, pycolmap.ViewGraphCalibrationOptions(random_seed=seed)
         )

@@ -177,13 +177,13 @@ class _Clip:
     images: list[np.ndarray]  # per frame, uint8 [H, W, 3]
 
     @classmethod
-    def of(cls, capture: Capture, index: int) -> _Clip:
+    def of(cls, capture: Capture, index: int, view: View) -> _Clip:
         images = []
         for image in capture.images(index, 0, _FRAMES):
             if isinstance(image, Exception):
                 raise image
             images.append(image)
-        view = View(capture.cameras[index], images[0], capture.masks[index]).reduced(_WIDTH)
+        view = view.at(images[0]).reduced(_WIDTH)
         size = view.camera.size
         # The images are whole frames: with the capture's delays they would be displaced twice.
         view = replace(view, camera=view.camera.without_delays())
@@ -211,8 +211,8 @@ class _Clips:
     @classmethod
     def of(cls, capture: Capture, progress: StepReport | None) -> _Clips:
         display = capture.displayed()
-        clips = tuple(_Clip.of(display, index) for index in range(len(capture.cameras)))
-        return cls(capture, progress, clips)
+        clips = [_Clip.of(display, index, view) for index, view in enumerate(display.views)]
+        return cls(capture, progress, tuple(clips))
 
     @property
     def train(self) -> list[int]:

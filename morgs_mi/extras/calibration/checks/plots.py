@@ -130,7 +130,8 @@ def draw_rig(
         ("From above", "right", "forward", [right, forward]),
         ("From the right", "forward", "up", [forward, up]),
     )
-    for axes, (title, x, y, plane) in zip(figure.subplots(1, 2), panels, strict=True):
+    for place, (title, x, y, plane) in enumerate(panels, 1):
+        axes = figure.add_subplot(1, 2, place)
         plane = np.transpose(plane)
         axes.set_title(title, fontsize=11, loc="left")
         axes.set(xlabel=f"{x}, world units", ylabel=f"{y}, world units")
@@ -158,16 +159,16 @@ def draw_rig(
                 arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkA": 0},
             )
         # The world's axes in the corner of the panel.
-        for name, color, direction in zip("xyz", _AXIS_COLORS, plane, strict=True):
+        for axis, direction in enumerate(plane):
             if np.linalg.norm(direction) > 0.4:
                 axes.annotate(
-                    name,
+                    "xyz"[axis],
                     (0.12, 0.12),
                     xycoords="axes fraction",
                     xytext=36 * direction,
                     textcoords="offset points",
-                    color=color,
-                    arrowprops={"arrowstyle": "<-", "color": color},
+                    color=_AXIS_COLORS[axis],
+                    arrowprops={"arrowstyle": "<-", "color": _AXIS_COLORS[axis]},
                 )
 
     axes.plot([], [], "o-", color=_USUAL, markersize=4, label="camera")
