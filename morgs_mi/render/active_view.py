@@ -77,15 +77,11 @@ class ActiveView:
             check_type(place, "static_splats", self.static_splats, StaticSplats)
         if self.region is not None:
             check_type(place, "region", self.region, Region)
-            size = f"{self.region.width}x{self.region.height}"
-            block = self.grid.block
             require(
-                (self.region.width, self.region.height) == self.camera.size
-                and self.region.block == block,
+                self.region.grid == self.grid,
                 place,
-                f"`region` must be of a {self.camera.width}x{self.camera.height} view with "
-                f"{block[0]}x{block[1]} blocks like the camera's and the config's",
-                f"{size} with {self.region.block[0]}x{self.region.block[1]}",
+                f"`region` must be of {self.grid} like the camera's and the config's",
+                f"one of {self.region.grid}",
                 "build it for this camera with this config",
             )
 
@@ -284,8 +280,7 @@ class Drawing:
                 )
             if behind is not None:
                 image = over(behind, image, repeat_each(weight[0], 3))
-            if self.group.region.weights is not None:
-                image = image * repeat_each(self.group.region.weights, 3)
+            image = self.group.region.within_view(image, 3)
             dr.eval(image)
         return image
 

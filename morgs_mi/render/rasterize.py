@@ -328,7 +328,9 @@ def draw(
             else:
                 images[name] = over(background, images[name], weight)
     tensors = {
-        name: _tensor(images[name], region, (*output.shape, sizes[name]))
+        name: mi.TensorXf(
+            region.within_view(images[name], sizes[name]), (*output.shape, sizes[name])
+        )
         for name in output.channels
     }
     return _image(tensors), lists
@@ -352,13 +354,6 @@ def _stacked(parts: list[Splats]) -> Splats:
     return parts[0]
 
 
-def _tensor(values: Float, region: DrawnBlocks, shape: tuple[int, ...]) -> Tensor:
-    """Return a channel's image; pixels of a region that lie outside the view are 0."""
-    if region.weights is not None:
-        values = values * repeat_each(region.weights, shape[-1])
-    return mi.TensorXf(values, shape)
-
-
 def _nothing(
     output: Output, features: Tensor | None, region: DrawnBlocks, background: Any
 ) -> Image:
@@ -370,7 +365,8 @@ def _nothing(
     if background is not None and "color" in images:
         shape = (*output.shape, 3)
         zeros = dr.zeros(mi.Float, prod(shape))
-        images["color"] = _tensor(over(background, zeros, zeros), region, shape)
+        color = region.within_view(over(background, zeros, zeros), 3)
+        images["color"] = mi.TensorXf(color, shape)
     return _image(images)
 
 
@@ -592,8 +588,7 @@ def _check_finite(
             worst = array[tuple(bad[0])]
             limit = "at most 1e18" if np.isfinite(worst) else "finite"
             index = ", ".join(map(str, bad[0]))
-            remedy = "" if name == "camera.viewmat" else "remove these Gaussians or "
             raise ValueError(
                 f"rasterize(): `{name}` must be {limit}, got {worst:g} at [{index}] ({len(bad)} "
-                f"such values); {remedy}lower the learning rate."
+                "such values); correct them, or lower the learning rate."
             )

@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import as_strided
 
 from morgs_mi.core.arrays import from_numpy, opaque
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import repeat_each
 from morgs_mi.core.types import Float, Jit, Point2u, UInt32
 from morgs_mi.render.backend import block_shape, elements, sections
 from morgs_mi.render.render_config import RenderConfig
@@ -37,6 +38,10 @@ class BlockGrid:
     width: int  #: Width of the view in pixels.
     height: int  #: Height of the view in pixels.
     block: tuple[int, int]  #: (width, height) of a block in pixels.
+
+    def __str__(self) -> str:
+        across, down = self.block
+        return f"a {self.width}x{self.height} view with {across}x{down} blocks"
 
     @classmethod
     def of(cls, camera: Camera, config: RenderConfig) -> BlockGrid:
@@ -118,6 +123,10 @@ class DrawnBlocks:
         if self.whole:
             return self.height, self.width, channels
         return self.num_blocks, self.block[1], self.block[0], channels
+
+    def within_view(self, image: Float, channels: int) -> Float:
+        """Return a flat image of `channels` floats per pixel with zeros outside the view."""
+        return image if self.weights is None else image * repeat_each(self.weights, channels)
 
     @property
     def section_sizes(self) -> tuple[UInt32, UInt32]:
@@ -311,8 +320,9 @@ def stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """
     shape = np.max([array.shape for array in arrays], axis=0)
     result = np.zeros((len(arrays), *shape), arrays[0].dtype)
-    for whole, array in zip(result, arrays, strict=True):
-        whole[: array.shape[0], : array.shape[1]] = array
+    for k, array in enumerate(arrays):
+        rows, columns = array.shape
+        result[k, :rows, :columns] = array
     return result
 
 

@@ -164,9 +164,9 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
 
 
 def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
-    with pytest.raises(ValueError, match=r"`region` must be of a 101x75 view with [48]x4 blocks"):
+    with pytest.raises(ValueError, match=r"must be of a 101x75 view with [48]x4 blocks like"):
         ActiveView(camera, region=Region.of(mask[:, :-1]))
-    with pytest.raises(ValueError, match="got 101x75 with 16x4"):
+    with pytest.raises(ValueError, match="got one of a 101x75 view with 16x4"):
         ActiveView(camera, region=Region.of(mask, RenderConfig(block_width=16)))
     broken = raw | {"means": np.where(np.arange(360).reshape(120, 3) == 7, np.nan, raw["means"])}
     with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[2, 1\]"):
