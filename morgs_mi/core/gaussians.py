@@ -235,13 +235,13 @@ class Gaussians:
         N = self.means.shape[0] if len(self.means.shape) else 0
         shapes = {a.name: [(N, *a.shape)] for a in ATTRIBUTES if a.activated_name != "sh_coeffs"}
         shapes["sh_coeffs"] = [(N, K, 3) for K in (1, 4, 9, 16)]
-        for name, value in self.items().items():
-            shape = tuple(value.shape)
+        for name, allowed in shapes.items():
+            value = getattr(self, name)
             require(
-                shape in shapes[name],
+                value is None or tuple(value.shape) in allowed,
                 "Gaussians()",
-                f"`{name}` must be {' or '.join(str(list(allowed)) for allowed in shapes[name])}",
-                list(shape),
+                f"`{name}` must be {' or '.join(str(list(shape)) for shape in allowed)}",
+                () if value is None else list(value.shape),
                 "all attributes describe the same Gaussians",
             )
 

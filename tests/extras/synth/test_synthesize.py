@@ -109,10 +109,8 @@ def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
 
 
 def test_synthesize__names_the_scenes(tmp_path):
-    with pytest.raises(
-        ValueError,
-        match=r"expected a scene, got 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'",
-    ):
+    scenes = "'arm', 'flicker', 'random', 'spheres'"
+    with pytest.raises(ValueError, match=f"a scene, got 'nowhere'; name one of .*{scenes}"):
         synthesize("nowhere", tmp_path / "clip")
 
 
