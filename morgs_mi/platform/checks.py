@@ -218,20 +218,21 @@ def check_points(
         f"{list(points.shape)} and {list(colors.shape)}",
         "pass a row and a colour for each point",
     )
-    for requirement, values, good, remedy in (
-        (
-            f"`points` must be finite and at most {LARGEST:g}",
-            points,
-            np.abs(points) <= LARGEST,
-            "remove this point",
-        ),
-        (
-            f"`point_colors` must be in [0, {most:g}]",
-            colors,
-            (colors >= 0) & (colors <= most),
-            "divide colours of 8 bits by 255",
-        ),
-    ):
-        row = int(np.argmin(good.all(axis=1)))
-        require(good.all(), place, requirement, f"{values[row].tolist()} at {row}", remedy)
+    outer = int(np.argmin((np.abs(points) <= LARGEST).all(axis=1)))
+    require(
+        bounded(points),
+        place,
+        f"`points` must be finite and at most {LARGEST:g}",
+        f"{points[outer].tolist()} at {outer}",
+        "remove this point",
+    )
+    are_colors = (colors >= 0) & (colors <= most)
+    other = int(np.argmin(are_colors.all(axis=1)))
+    require(
+        are_colors.all(),
+        place,
+        f"`point_colors` must be in [0, {most:g}]",
+        f"{colors[other].tolist()} at {other}",
+        "divide colours of 8 bits by 255",
+    )
     return points, colors

@@ -135,7 +135,7 @@ def _chain(error: BaseException) -> list[BaseException]:
     for link in links:  # which grows
         members = link.exceptions if isinstance(link, BaseExceptionGroup) else ()
         for other in (link.__cause__, link.__context__, *members):
-            if other is not None and all(other is not entry for entry in links):
+            if other is not None and other not in links:
                 links.append(other)
     return links
 

@@ -127,9 +127,10 @@ def _ring(box: np.ndarray, axes: Axes) -> tuple[Camera, ...]:
     # Half of the width that the image needs at each corner [8, 8], for its height as well.
     half_widths = np.maximum(np.abs(aside), np.abs(corners @ up)[:, None] * _WIDTH / _HEIGHT)
     distance = (toward + half_widths / np.tan(np.deg2rad(_FOV_X / 2))).max()
+    positions = center + distance * arms
     return tuple(
-        Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name)
-        for name, arm in zip(_NAMES, arms, strict=True)
+        Camera.look_at(positions[k], center, up, _FOV_X, _WIDTH, _HEIGHT, name)
+        for k, name in enumerate(_NAMES)
     )
 
 

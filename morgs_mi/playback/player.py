@@ -168,13 +168,13 @@ def playback_speed(stream: FrameSource, camera: Camera, config: RenderConfig) ->
     there are others.
 
     Args:
-        stream: the file.
+        stream: the file, with at least one frame.
         camera: any view.
         config: settings of the renderer, see `render_config`.
 
     Returns:
         ``fps``, frames per second at the size of `camera`, and the medians ``decode_ms`` and
-        ``render_ms`` from which it is computed; NaN for a stream without frames.
+        ``render_ms`` from which it is computed.
 
     Raises:
         ValueError: a broken packet.
@@ -189,7 +189,7 @@ def playback_speed(stream: FrameSource, camera: Camera, config: RenderConfig) ->
         to_uint8(render(gaussians, camera, ("color",), config)["color"])
         times.append((decoding, time.perf_counter() - start))
         start = time.perf_counter()
-    decode, draw = np.median(times[1:] or times or [(np.nan, np.nan)], axis=0)
+    decode, draw = np.median(times[1:] or times, axis=0)
     return {
         "fps": float(1 / (decode + draw)),
         "decode_ms": float(1e3 * decode),

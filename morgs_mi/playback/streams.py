@@ -86,17 +86,10 @@ def stream_path(out: str | Path) -> Path:
     path = Path(out)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; check the path.")
-    if path.is_dir() and not (path / STREAM).exists():
-        inner = [file for file in listed(path) if suffix_of(file) or (file / STREAM).is_file()]
-        require(
-            not inner,
-            path,
-            "expected a stream",
-            f"a folder with {few([file.name for file in inner], 3)}",
-            "name one of them, or make a stream of files of Gaussians by `morgs-mi import`",
-        )
     remedy = f"if {path} is a capture, fit it first: morgs-mi fit {path} OUT"
-    path = path / STREAM if path.is_dir() else path
+    if path.is_dir():
+        _check_fit(path)
+        path = path / STREAM
     existing_file(path, "a stream", remedy)
     with path.open("rb") as file:
         start = file.read(len(MAGIC))
@@ -109,6 +102,19 @@ def stream_path(out: str | Path) -> Path:
             f"name the folder of a fit, fit a capture first, or if it has Gaussians, {CONVERT}",
         )
     return path
+
+
+def _check_fit(folder: Path) -> None:
+    """Check that a folder is not one with several fits, or with files of Gaussians."""
+    if not (folder / STREAM).exists():
+        inner = [file for file in listed(folder) if suffix_of(file) or (file / STREAM).is_file()]
+        require(
+            not inner,
+            folder,
+            "expected a stream",
+            f"a folder with {few([file.name for file in inner], 3)}",
+            "name one of them, or make a stream of files of Gaussians by `morgs-mi import`",
+        )
 
 
 def open_stream(

@@ -123,8 +123,8 @@ def packed(arrays: Arrays) -> tuple[Packing, UInt32]:
     return Packing(tuple(places)), from_numpy(mi.UInt32, np.concatenate(words))
 
 
-def padded(values: Jit, size: int, fill: float = 0) -> Jit:
-    """Return an array, then `fill` up to a size."""
+def padded(values: Jit, size: int) -> Jit:
+    """Return an array, then zeros up to a size."""
     lane = dr.arange(mi.UInt32, size)
     is_inside = lane < opaque(mi.UInt32, dr.width(values))
-    return dr.select(is_inside, dr.gather(type(values), values, lane, is_inside), fill)
+    return dr.select(is_inside, dr.gather(type(values), values, lane, is_inside), 0)

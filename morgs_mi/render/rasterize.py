@@ -388,14 +388,6 @@ def _check_scene(
     """Raise an error unless Gaussians have channels, and the variant can differentiate them."""
     kind = f"a {type(gaussians).__name__}"
     require(hasattr(gaussians, "means"), place, "`gaussians` must be Gaussians", kind, "pass some")
-    for name, names in (("channels", channels), ("detach_weights", detach_weights)):
-        require(
-            isinstance(names, Sequence) and not isinstance(names, str),
-            place,
-            f"`{name}` must be a sequence of names",
-            repr(names),
-            "pass a tuple",
-        )
     require(
         mi.variant() and dr.is_jit_v(mi.Float) and dr.is_diff_v(mi.Float),
         place,
@@ -406,12 +398,23 @@ def _check_scene(
     motion = BY_ACTIVATED_NAME["motion"]
     required = {"motion": motion, "guided_motion": motion, **attribute_channels()}
     choices = ("color", "alpha", "depth", *required)
-    for name in (*channels, *detach_weights):
+    for argument, names, allowed in (
+        ("channels", channels, choices),
+        ("detach_weights", detach_weights, (*choices, "features")),
+    ):
         require(
-            name in choices or (name == "features" and name not in channels),
+            isinstance(names, Sequence) and not isinstance(names, str),
             place,
-            f"`channels` must be out of {', '.join(choices)}",
-            repr(name),
+            f"`{argument}` must be a sequence of names",
+            repr(names),
+            "pass a tuple",
+        )
+        unknown = sorted({*map(repr, names)} - {*map(repr, allowed)})
+        require(
+            not unknown,
+            place,
+            f"`{argument}` must be out of {', '.join(allowed)}",
+            ", ".join(unknown),
             "use one of these, or pass other values as `features`",
         )
     for name, attribute in required.items():

@@ -143,9 +143,6 @@ def test_playback_speed__is_the_inverse_of_the_time_per_frame(fitted_clip, tmp_p
     assert times["fps"] == pytest.approx(1e3 / (times["decode_ms"] + times["render_ms"]))
     assert min(times.values()) > 0
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25) as writer:
-        assert np.isnan(
-            playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0], config)["fps"]
-        )
         writer.write(keyframe_packet(moved(0), 0))
     assert playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0], config)["fps"] > 0
 

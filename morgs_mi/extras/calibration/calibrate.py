@@ -36,7 +36,7 @@ from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.types import Arrays
-from morgs_mi.extras.calibration.checks.rig_check import CameraCheck
+from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, median
 from morgs_mi.fit.image_points import MAX_ERROR
 from morgs_mi.io.clip_readers import open_clips
 from morgs_mi.platform.checks import few, require, valid_pixels
@@ -99,14 +99,22 @@ class CalibrationResult:
     """Result of `calibrate`."""
 
     model: Path  #: Folder of the COLMAP model.
-    cameras: tuple[str, ...]  #: Names of the calibrated cameras.
-    left_out: tuple[str, ...]  #: Names of the cameras that could not be calibrated.
     points: int  #: Number of points.
     error: float  #: Mean reprojection error of the points, px.
     #: Result of every camera, including the ones left out; `matches` is the number of its points.
     checks: tuple[CameraCheck, ...]
     mapper: Mapper  #: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
     principal_points: bool  #: Whether each image has a principal point of its own.
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the calibrated cameras."""
+        return tuple(check.name for check in self.checks if check.fits is not None)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the cameras that could not be calibrated."""
+        return without_pose(self.checks)
 
 
 @dataclass(frozen=True)
@@ -124,16 +132,20 @@ class Candidate:
         return float(self.model.compute_mean_reprojection_error())
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """Names of the cameras without a pose."""
-        return tuple(check.name for check in self.checks if check.fits is None)
-
-    @property
     def rank(self) -> tuple[int, int, float]:
         """Number of cameras that fit, negative number of cameras without a pose, and the negative
         error; larger is better.
         """
-        return sum(check.fits is True for check in self.checks), -len(self.left_out), -self.error
+        return (
+            sum(check.fits is True for check in self.checks),
+            -len(without_pose(self.checks)),
+            -self.error,
+        )
+
+
+def without_pose(checks: Sequence[CameraCheck]) -> tuple[str, ...]:
+    """Return the names of the cameras without a pose."""
+    return tuple(check.name for check in checks if check.fits is None)
 
 
 def import_pycolmap() -> Any:
@@ -194,8 +206,6 @@ def calibrate(
         report("Mapping", 1, 1)
         result = CalibrationResult(
             path / "sparse" / "0",
-            tuple(check.name for check in best.checks if check.fits is not None),
-            best.left_out,
             best.model.num_points3D(),
             best.error,
             best.checks,
@@ -260,12 +270,11 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
         advice = f"it could not be registered and has no pose: {_MORE_TEXTURE}"
         return CameraCheck(name, 0, float("nan"), None, advice)
     errors = []
-    for point in image.points2D:
-        if point.has_point3D():
-            pixel = image.project_point(model.point3D(point.point3D_id).xyz)
-            # No pixel: the point lies behind the camera.
-            errors.append(np.inf if pixel is None else np.linalg.norm(pixel - point.xy))
-    error = float(np.median(errors)) if errors else float("nan")
+    for point in image.get_observation_points2D():
+        pixel = image.project_point(model.point3D(point.point3D_id).xyz)
+        # No pixel: the point lies behind the camera.
+        errors.append(np.inf if pixel is None else np.linalg.norm(pixel - point.xy))
+    error = median(errors)
     advice = ""
     if len(errors) < _MIN_POINTS:
         advice = (
@@ -419,7 +428,7 @@ def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Can
     pycolmap = import_pycolmap()
 
     candidates = _mapped(names, scratch, seed)
-    if all(candidate.left_out for candidate in candidates):
+    if all(without_pose(candidate.checks) for candidate in candidates):
         pycolmap.calibrate_view_graph(
             scratch / _DATABASE, pycolmap.ViewGraphCalibrationOptions(random_seed=seed)
         )
@@ -484,13 +493,15 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    medians = []
-    for each in (candidate.model, model):
-        each.update_point_3d_errors()
-        medians.append(np.median([point.error for point in each.points3D.values()] or [0]))
-    if not medians[1] < (1 - _LEAST_DECREASE) * medians[0]:
+    if not _median_error(model) < (1 - _LEAST_DECREASE) * _median_error(candidate.model):
         return candidate
     return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
+
+
+def _median_error(model: Any) -> float:
+    """Return the median of the reprojection errors of a model's points, px; NaN without points."""
+    model.update_point_3d_errors()
+    return median([point.error for point in model.points3D.values()])
 
 
 @contextmanager

@@ -60,7 +60,7 @@ def write_images(
 
     def display_frames() -> Iterator[_Frame]:
         for count, (frame, images) in enumerate(rendered, start=1):
-            if exposure and "color" in images:
+            if "color" in images:
                 images = {**images, "color": exposed(images["color"], exposure)}
             yield frame, images
             if progress is not None:

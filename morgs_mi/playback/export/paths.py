@@ -134,7 +134,7 @@ def orbit(
     first = cameras[0]
     up = up_direction(cameras)
     arm = first.position - center
-    if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
+    if np.linalg.norm(np.cross(arm, up)) <= 1e-3 * np.linalg.norm(arm):
         raise ValueError(
             f"orbit(): the camera {first.name!r} must stand beside the scene; use another path."
         )

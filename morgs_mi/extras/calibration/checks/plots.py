@@ -77,16 +77,12 @@ def _draw_images(figure: Any, capture: Capture) -> None:
         axes.set(xticks=[], yticks=[], frame_on=False)
     for view, image in enumerate(images):
         axes = grid[view]
-        axes.set_title(_name(capture.cameras[view], view), fontsize=_FONT_SIZE)
+        axes.set_title(capture.names[view], fontsize=_FONT_SIZE)
         axes.set_frame_on(True)
         axes.spines[:].set(color=_color(view, capture.test_views), linewidth=2)
         if image is not None:
             scale = min(1, _IMAGE_SIZE / max(image.shape))
             axes.imshow(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-
-
-def _name(camera: Camera, view: int) -> str:
-    return camera.name or str(view)
 
 
 def _color(view: int, test_views: Collection[int]) -> str:
@@ -143,7 +139,7 @@ def draw_rig(
         axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
         axes.grid(color="0.9")
         views = (frusta @ plane).reshape(-1, 5, 2)
-        names = [_name(camera, view) for view, camera in enumerate(cameras)]
+        names = [camera.name for camera in cameras]
         name_places = _places_beside(views, names, 2 * half / _PANEL)
         for view, frustum in enumerate(views):
             color = _color(view, test_views)

@@ -38,6 +38,7 @@ _FACTOR_PAIRS = 8
 # for 20 views, and the least one; errors are those at the largest.
 _WIDTH = 480
 _LEAST_WIDTH = 160
+_VERDICTS = {None: "not checked", True: "fits", False: "does not fit"}
 _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the "
     "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
@@ -67,7 +68,7 @@ class CameraCheck:
     @property
     def verdict(self) -> str:
         """The result in words."""
-        return "not checked" if self.fits is None else "fits" if self.fits else "does not fit"
+        return _VERDICTS[self.fits]
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def check_cameras(cameras: Sequence[Camera], layout: str, shared: SharedFeatures
         advice = f"the poses of {not_checked} could not be checked."
     if correction:
         advice = f"the poses do not fit the images: {correction[1]}."
-    return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
+    return RigCheck(len(errors), len(shared.matches), median(errors), tuple(checks), fits, advice)
 
 
 def pose_problems(views: Sequence[View]) -> list[str]:
@@ -195,7 +196,7 @@ class _Pairs:
 
     def worst(self) -> float:
         """Return the largest median error of a view, px; there must be matches."""
-        return float(np.nanmax([_median(self.of_view(view, self.views)) for view in self.views]))
+        return float(np.nanmax([median(self.of_view(view, self.views)) for view in self.views]))
 
     def agreeing(self) -> set[int]:
         """Return the views with mostly small errors in the matches between them.
@@ -214,7 +215,8 @@ class _Pairs:
         return group
 
 
-def _median(errors: np.ndarray) -> float:
+def median(errors: Sequence[float] | np.ndarray) -> float:
+    """Return the median of some errors; NaN of none."""
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
@@ -232,7 +234,7 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
         advice = f"only {len(errors)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
     if not len(pairs.shared.features[view].points):
         advice = _NO_FEATURES
-    error = _median(errors)
+    error = median(errors)
     fits = None if advice else error <= MAX_ERROR
     if fits is False:
         advice = _WRONG_POSE
@@ -247,7 +249,7 @@ def _correct_rig(layout: str, pairs: _Pairs) -> tuple[Sequence[Camera], str] | N
     # The pairs with the most matches determine a factor on all focal lengths.
     largest = pairs.sampled(_FACTOR_PAIRS).shared
     candidates = focal_candidates(
-        pairs.cameras, lambda cameras: _median(_Pairs.of(largest, cameras).errors)
+        pairs.cameras, lambda cameras: median(_Pairs.of(largest, cameras).errors)
     )
     if error > _GOOD_ERROR:
         candidates = [*rig_candidates(pairs.cameras, layout), *candidates]

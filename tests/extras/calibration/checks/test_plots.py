@@ -20,12 +20,13 @@ from tests.scenes.cameras import arc, look_at_cameras
 def test_draw_rig__draws_cameras_at_their_positions():
     """Seen from above, ahead of the cameras is up; distant points are cut off."""
     cameras = [
-        Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)
+        Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, f"{x:g}")
+        for x in (-1.0, 0.0, 1.0)
     ]
     figure = Figure()
     draw_rig(figure, cameras, (np.array([[0.0, 0, 3], [1e6, 0, 0]]), np.ones((2, 3))))
     above = figure.axes[0]
-    assert [name.get_text() for name in above.texts[:3]] == ["0", "1", "2"]
+    assert [name.get_text() for name in above.texts[:3]] == ["-1", "0", "1"]
     assert_close([name.xy for name in above.texts[:3]], [(-1, 0), (0, 0), (1, 0)], atol=1e-6)
     assert_close(np.asarray(above.collections[0].get_offsets()), [(0, 3)], atol=1e-6)
 
