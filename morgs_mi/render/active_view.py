@@ -227,7 +227,7 @@ class ViewGroup:
                 splats = visible if splats is None else visible.concatenated_with(splats)
             if splats is None:
                 return Drawing(self, None, lanes, N)
-            lists = build_lists(splats, list(splats.channels["color"]), self.region, self.config)
+            lists = build_lists(splats, splats.columns(("color",)), self.region, self.config)
         return Drawing(self, (splats, lists), lanes, N)
 
     @cached_property
@@ -275,9 +275,8 @@ class Drawing:
             if self.drawn is not None:
                 splats, lists = self.drawn
                 layout = Layout((Channel(3, True),), behind is not None, False, self.group.config)
-                image, *weight = blend(
-                    splats.geometry, [splats.channels["color"]], self.group.region, lists, layout
-                )
+                values = [*splats.geometry, *splats.columns(("color",))]
+                image, *weight = blend(values, self.group.region, lists, layout)
             if behind is not None:
                 image = over(behind, image, repeat_each(weight[0], 3))
             image = self.group.region.within_view(image, 3)

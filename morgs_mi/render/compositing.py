@@ -24,32 +24,25 @@ from morgs_mi.render.region import NO_SLOT, DrawnBlocks, quotient, quotient_and_
 
 
 def blend(
-    geometry: tuple[Float, ...],
-    channels: list[tuple[Float, ...]],
-    region: DrawnBlocks,
-    lists: BlockLists,
-    layout: Layout,
-    absolute: tuple[Float, ...] = (),
+    values: list[Float], region: DrawnBlocks, lists: BlockLists, layout: Layout
 ) -> list[Float]:
     """Blend every channel's columns over a region.
 
     Args:
-        geometry: see `Splats.geometry`, floats [N].
-        channels: the columns of each channel, floats [N].
+        values: floats [N]: the splats' geometry (see `Splats.geometry`), the columns of the
+            channels, and with `layout.absolute` two columns that are not read, and whose gradients
+            are the sums of the absolute gradients of the means over the pixels.
         region: the blocks that are drawn.
-        lists: the splats that touch them, built from the same geometry and columns, and perhaps
-            further splats after them, which get no gradients.
+        lists: the splats that touch them, built from the same values, and perhaps further splats
+            after them, which get no gradients.
         layout: sizes of the channels, whether their gradients reach the weights, and cut-offs.
-        absolute: two columns that are not read, and whose gradients are the sums of the absolute
-            gradients of the means over the pixels; none without `layout.absolute`.
 
     Returns:
         The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one
         for output, one to divide by, because forward mode clears the gradients of an array that is
-        used further. Differentiable in `geometry` and `channels` by `dr.backward` and `dr.forward`.
+        used further. Differentiable in `values` by `dr.backward` and `dr.forward`.
     """
-    columns = [column for channel in channels for column in channel]
-    return dr.custom(_Blend, [*geometry, *columns, *absolute], _Constants(region, lists, layout))
+    return dr.custom(_Blend, values, _Constants(region, lists, layout))
 
 
 class _Constants:

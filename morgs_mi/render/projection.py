@@ -104,6 +104,10 @@ class Splats:
         cut = self.profile
         return shape if cut is None else (*shape, cut.mean, *cut.slope, cut.r_sigma)
 
+    def columns(self, channels: Sequence[str]) -> list[Float]:
+        """Return the blended values of some channels, one column after the other."""
+        return [column for name in channels for column in self.channels[name]]
+
     @property
     def _present(self) -> dict[str, Jit]:
         """The fields that are not None."""

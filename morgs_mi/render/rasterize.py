@@ -297,12 +297,12 @@ def draw(
         region: the blocks to draw.
         background: as for `rasterize`.
         limits: flat depth limits of the pixels of the view.
-        absolute: as for `blend`.
+        absolute: two columns that are not read, and whose gradients are the sums of the absolute
+            gradients of the means over the pixels; empty: none.
     """
     blended = output.blended
     with dr.suspend_grad():
-        columns = [column for name in blended for column in drawn.channels[name]]
-        lists = build_lists(drawn, columns, region, output.config, limits)
+        lists = build_lists(drawn, drawn.columns(blended), region, output.config, limits)
     sizes = {**{name: len(splats.channels[name]) for name in blended}, "alpha": 1}
     # Divided by the sum of the weights, or composited by it over the background.
     weighted = NORMALISED if background is None else (*NORMALISED, "color")
@@ -315,8 +315,8 @@ def draw(
         limits is not None,
         bool(absolute),
     )
-    values = [splats.channels[name] for name in blended]
-    images = blend(splats.geometry, values, region, lists, layout, absolute)
+    values = [*splats.geometry, *splats.columns(blended), *absolute]
+    images = blend(values, region, lists, layout)
     images = dict(zip((*blended, "alpha", "coverage"), images, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
