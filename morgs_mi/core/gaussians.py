@@ -355,8 +355,9 @@ class Gaussians:
             f"none of the name {', '.join(missing)}",
             "see Gaussians.parameters()",
         )
-        names = BY_NAME.keys() & parameters.keys()
-        return cls(**_raw_attributes({name: parameters[name] for name in names}))
+        # In the order of the table: kernels in Dr.Jit's cache have the order of their trace.
+        given = {name: parameters[name] for name in BY_NAME if name in parameters}
+        return cls(**_raw_attributes(given))
 
     def with_parameters(self, parameters: Tensors) -> Gaussians:
         """Return these Gaussians with some of their `parameters` replaced.
