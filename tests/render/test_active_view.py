@@ -1,7 +1,5 @@
 """An active view against the full view: same pixels, same gradients."""
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -81,21 +79,10 @@ def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, 
     assert_close(backproject(active, view, view.crop(image)), expected, rtol=tol.SUM_ORDER_REL)
 
 
-def test_with_static__accepts_no_static_gaussians_in_the_view(camera, gaussians, mask):
-    none = gaussians.select(np.arange(3))
-    none = replace(none, means=np.full((3, 3), -1e4))  # behind the camera
-    view = make_active_view(camera, Region.of(mask), none, CHANNELS, RenderConfig())
-    assert view.static_splats is None
-    full = rasterize(gaussians, camera, ("color",)).color
-    assert np.array_equal(render_view(gaussians, view).color, view.crop(np.asarray(full)))
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"camera": None}, "`camera` must be a .*Camera, got a NoneType; convert a Mitsuba sensor"),
-        ({"config": {}}, "`config` must be a .*RenderConfig, got a dict"),
-        ({"region": "all"}, "`region` must be a .*Region, got a str"),
         ({"static_splats": "all"}, "`static_splats` must be a .*StaticSplats"),
     ],
 )

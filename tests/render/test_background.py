@@ -11,7 +11,6 @@ from morgs_mi import Camera, RenderConfig, StreamLoop, View, fit_gaussians, rast
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.platform.png import PngImage, png_bytes
 from morgs_mi.playback.stream_header import render_config
@@ -54,8 +53,8 @@ def test_rasterize__composites_over_images_and_colours(gaussians):
     assert_close(rasterize(gaussians, CAMERA, config=config).color, colored, atol=IMAGE_ABS)
     both = rasterize(gaussians, [BEHIND, CAMERA], config=config).color
     assert_close(both, np.stack([expected, colored]), atol=IMAGE_ABS)
-    black = rasterize(gaussians, BEHIND, background=(0, 0, 0)).color
-    assert_close(black, over(gaussians, (0, 0, 0)), atol=IMAGE_ABS)
+    given = rasterize(gaussians, BEHIND, background=COLOR).color
+    assert_close(given, colored, atol=IMAGE_ABS)
 
 
 def test_rasterize__gradient_of_an_image_behind_is_the_transmittance(gaussians):
@@ -87,8 +86,6 @@ def test_camera__resizes_and_refuses_backgrounds():
     with pytest.raises(ValueError, match=r"`background` must be .* \[33, 48, 3\], got float64 \[4"):
         replace(CAMERA, background=np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="`background` must have numbers from -32 to 32, 1 for wh"):
-        replace(CAMERA, background=np.full((H, W, 3), np.nan))
-    with pytest.raises(ValueError, match="`background` must have numbers from -32 to 32, 1 for wh"):
         replace(CAMERA, background=np.full((H, W, 3), 1e11))
     with pytest.raises(ValueError, match=r"`background` must be a PNG file of 48x33 .* of 3x2"):
         replace(CAMERA, background=PngImage(png_bytes(np.zeros((2, 3, 3), np.uint8))))
@@ -97,7 +94,6 @@ def test_camera__resizes_and_refuses_backgrounds():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"config": {}}, r"fit_gaussians\(\): `config` must be a .*StreamConfig, got a dict"),
         ({"sensors": None}, r"fit_gaussians\(\): `sensors` must be a .*Sequence, got a NoneType"),
         (
             {"background": 3 * (1e30,)},
@@ -107,8 +103,6 @@ def test_camera__resizes_and_refuses_backgrounds():
             {"sensors": [View(CAMERA, mask=np.ones((2, 3), bool))]},
             r"the mask must be bool \[.*, got .*2, 3",
         ),
-        ({"background": 1.0}, r"`background` must be a list of 3 items, got \(1.0,\)"),
-        ({"background": np.full((1, H, W, 3), 1e11)}, "`background` must have numbers from -32 to"),
     ],
 )
 def test_fit_gaussians__refuses_absurd_arguments(arguments, message):
@@ -139,30 +133,6 @@ def test_fit_gaussians__equals_the_loop_over_a_colour_and_over_images():
             assert np.array_equal(value, loop.gaussians.numpy()[name]), name
         results.append(fitted.gaussians.numpy()["sh_coeffs"])
     assert np.abs(results[0] - results[1]).max() > 0.01
-    with pytest.raises(ValueError, match=r"`background` must be .* \[4, 48, 64, 3\]"):
-        fit_gaussians(cameras, images, *cloud, config, background=behind[:2])
-
-
-def test_stream_loop__fits_what_stands_before_the_background():
-    """A ball before white: without a background, Gaussians for the white hide it in other views."""
-    ball = opaque_ball()
-    means = ball.numpy()["means"]
-    white = RenderConfig(background=(1.0, 1.0, 1.0))
-    cameras = look_at_cameras(QUAD, 90)
-    other = Camera.look_at((2.5, -1, -3), (0, 0, 0), (0, -1, 0), 90, 64, 48)
-    *images, truth = (
-        np.clip(np.array(rasterize(ball, camera, config=white).color), 0, 1)
-        for camera in (*cameras, other)
-    )
-    scores = []
-    for settings in (RenderConfig(), white):
-        config = quick(num_gaussians=400, first_frame_steps=100, density=NO_DENSITY)
-        config = replace(config, render=settings)
-        loop = StreamLoop(cameras, means, np.full((len(means), 3), 0.5), config)
-        loop.push([np.uint8(255 * image + 0.5) for image in images])
-        image = np.array(rasterize(loop.gaussians, other, config=settings).color)
-        scores.append(psnr(np.clip(image, 0, 1), truth))
-    assert scores[1] > scores[0] + 6
 
 
 def test_fits__without_points_find_the_colour_of_the_borders(caplog):
@@ -180,15 +150,12 @@ def test_fits__without_points_find_the_colour_of_the_borders(caplog):
     assert_close(fitted.background, color, atol=IMAGE_ABS)
     assert "the colour of the images' borders, (0.2, 0.6, 0.8)" in caplog.messages[0]
     none = np.zeros((0, 3)), np.zeros((0, 3))
-    loop = StreamLoop(cameras, *none, quick())
+    loop, resumed = (StreamLoop(cameras, *none, quick()) for _ in range(2))
     loop.push(images)
     assert loop.setup.config.render == fitted.render
-    resumed = StreamLoop(cameras, *none, quick())
     resumed.resume(loop.state.coded, [images], loop.state.exposures)
-    next_images = [np.roll(image, 3, axis=1) for image in images]
-    packets = [each.push(next_images)[0] for each in (loop, resumed)]
-    for name, values in packets[0].arrays.items():
-        assert np.array_equal(values, packets[1].arrays[name]), name
+    following = [np.roll(image, 3, axis=1) for image in images]
+    assert loop.push(following)[0].encoded == resumed.push(following)[0].encoded
     points = opaque_ball().numpy()["means"]
     assert fit_gaussians(cameras, images, points, config=quick()).background is None
     white = (1.0, 1.0, 1.0)

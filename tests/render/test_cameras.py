@@ -31,7 +31,7 @@ def gaussians():
     return to_gaussians(make_scene())
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("count", [1, 3])
 def test_rasterize__draws_cameras_together_as_one_by_one(gaussians, count):
     views = cameras(count)
     batch = rasterize(gaussians, views, CHANNELS, background=(0.2, 0.4, 0.6))
@@ -80,9 +80,3 @@ def test_rasterize__refuses_cameras_that_do_not_fit(gaussians):
         rasterize(gaussians, [first, replace(second, width=90)])
     with pytest.raises(ValueError, match="got an empty sequence"):
         rasterize(gaussians, [])
-
-
-def test_rasterize__draws_no_gaussians_in_several_cameras(gaussians):
-    image = rasterize(gaussians.select(slice(0)), cameras(2), background=(0.1, 0.2, 0.3))
-    assert image.color.shape == (2, 37, 45, 3)
-    assert_close(np.array(image.color)[1, 0, 0], (0.1, 0.2, 0.3), atol=1e-7)

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 from morgs_mi import rasterize
-from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.rasterize import render_view
-from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.derivatives import gradient
@@ -47,17 +44,6 @@ def test_rasterize__renders_a_new_attribute_of_the_table(scene):
     )
     with pytest.raises(ValueError, match=r"`normals` must be finite, got nan at \[2, 1\]"):
         rasterize(broken, camera, ("normal",))
-
-
-@pytest.mark.usefixtures("new_attributes")
-def test_rasterize__renders_on_a_region_a_new_attribute_of_the_table(scene):
-    raw, camera = scene
-    gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"])
-    mask = np.zeros((camera.height, camera.width), bool)
-    mask[9, 10] = True
-    region = Region.of(mask)
-    image = render_view(gaussians, ActiveView(camera, region=region), ("roughness", "confidence"))
-    assert_close(image["roughness"], image.confidence)
 
 
 def test_image__is_indexed_by_channel(scene):

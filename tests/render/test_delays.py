@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from morgs_mi import rasterize
-from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.scenes.cameras import make_camera
@@ -43,27 +41,6 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
     raw, camera = moving
     delayed = replace(camera, delay=-0.3, readout=0.6)
     assert_backward_agrees_with_differences(raw, delayed, ("means", "motion"))
-
-
-def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving):
-    """The decoded motion is the whole displacement."""
-    raw, camera = moving
-    start = replace(to_gaussians(raw), motion=None, offset=None)
-    config = CodecConfig(quality=8)
-    coded = decode(None, keyframe_packet(start, 0, [camera], config))
-    offset = 0.02 * raw["offset"] / np.abs(raw["offset"]).max()
-    target = replace(start, means=raw["means"] + 2 * offset, motion=2 * offset, offset=offset)
-    packet = residual_packet(coded, target, np.arange(len(raw["means"])), [camera], config)
-    gaussians = decode(coded, packet).gaussians
-    late = replace(
-        gaussians, means=gaussians.means + 0.7 * gaussians.motion, motion=None, offset=None
-    )
-    expected = rasterize(late, camera, ("color",)).color
-    assert_close(
-        rasterize(gaussians, replace(camera, delay=0.7), ("color",)).color,
-        np.asarray(expected),
-        atol=tol.IMAGE_ABS,
-    )
 
 
 def test_rasterize__draws_the_guided_part_of_the_motion(moving):

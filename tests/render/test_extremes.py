@@ -156,11 +156,6 @@ def test_rasterize__fuzz():
     assert not fuzz(range(4))
 
 
-@pytest.mark.slow
-def test_rasterize__fuzz_with_further_seeds():
-    assert not fuzz(range(4, 10))
-
-
 @pytest.mark.long
 def test_rasterize__fuzz_with_many_seeds():
     assert not fuzz(range(10, 210))

@@ -93,27 +93,6 @@ def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(
     assert_same_gradients(grads, full_grads)
 
 
-def test_rasterize__blends_features_on_a_region(raw, camera, mask):
-    rng = np.random.default_rng(0)
-    region = Region.of(mask)
-    values = np.float32(rng.normal(size=(len(raw["means"]), 5)))
-
-    def run_features(where=None):
-        features = mi.TensorXf(values)
-        dr.enable_grad(features)
-        view = ActiveView(camera, region=where)
-        image = render_view(Gaussians(**raw), view, (), features=features).features
-        shown = image * (1 if where else mi.TensorXf(np.float32(drawn_pixels(region, mask))))
-        backward(dr.square(shown))
-        return np.asarray(dr.detach(image)), gradient(features)
-
-    expected, full = run_features()
-    blend, grad = run_features(region)
-    assert np.array_equal(blend, region.crop(expected))
-    assert np.abs(full).max() > 0
-    assert_close(grad, full, atol=tol.SUM_ORDER_REL * np.abs(full).max())
-
-
 def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
     region = Region.of(mask)
     results = []

@@ -91,16 +91,6 @@ def test_view_group__crops_images_of_its_views(gaussians):
         assert np.array_equal(part, view.drawn.crop(image))
 
 
-def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):
-    camera = make_wide_camera()
-    group = ViewGroup([ActiveView(camera)])
-    place = camera.position - 10 * np.asarray(camera.viewmat)[2, :3]
-    behind = replace(gaussians, means=np.tile(place, (len(gaussians), 1)))
-    drawing = group.draw(behind)
-    assert not np.asarray(drawing.color).any()
-    assert not drawing.sums(from_numpy(mi.Float, np.ones(group.region.shape(1))), 1).any()
-
-
 def test_totals__are_the_sums_over_all_views(gaussians):
     group = ViewGroup(views_of(gaussians))
     drawing = group.draw(gaussians)
