@@ -5,10 +5,12 @@ import inspect
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import morgs_mi
 from tests.scenes.cameras import QUAD, look_at_cameras
+from tests.scenes.gaussians import isotropic
 from tests.scenes.programs import run_script
 
 ROOT = Path(__file__).parents[1]
@@ -79,6 +81,14 @@ def test_front_door__reprs_are_short():
         (
             morgs_mi.FrameReport(3, 1.25, 400, {"recon": 0.1}, 20),
             "FrameReport(frame 3, 20 Gaussians, 400 bytes, 1.2 s, ok)",
+        ),
+        (
+            morgs_mi.Camera.look_at((0, -4, 1.25), (0, 0, 0), (0, 0, 1), 40, 64, 48, "cam00"),
+            "Camera('cam00', 64x48, 40 degrees across, at (0, -4, 1.25))",
+        ),
+        (
+            isotropic([(0, 0, 0), (2, 1, 0.25)], 0.1, 0.9, motion=np.zeros((2, 3))),
+            "Gaussians(N=2, SH degree 0, box of 2 x 1 x 0.25, motion)",
         ),
         (
             morgs_mi.StreamLoop(look_at_cameras(QUAD), [], []),

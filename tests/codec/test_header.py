@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi.codec.container import StreamWriter, header_fields, header_json, load_json
-from morgs_mi.core.camera import Camera
+from morgs_mi.codec.container import header_fields, header_json, load_json
 from morgs_mi.core.color_space import byte_values
 from morgs_mi.platform.png import PngImage, jpeg_bytes, png_bytes
 from morgs_mi.render.rasterize import rasterize
@@ -54,15 +53,12 @@ def with_entry(path, text):
     [
         ("fps", "1e999", "numbers must be finite, got 1e999"),
         ("fps", "0", "`fps` must be a number from 1e-6 to 1e6, got 0"),
-        ("fps", "true", "`fps` must be a number .* got True"),
         ("fps", "1" + 400 * "0", "integers must have at most 64 bits, got 1000"),
         ("cameras", "[]", "`cameras` must be a list of at least one camera"),
         ("cameras.1", "7", r"`cameras\[1\].name` must be a string, got None"),
         ("cameras.0.K.0.0", "-1", "must be finite with positive focal lengths"),
-        ("metadata", "[]", r"`metadata` must be an object, got \[\]"),
         ("metadata.seed", f"[{'0,' * 2**20}0]", "at most 1048576 commas and opening brackets"),
         ("metadata.seed", "[" * 31 + "]" * 31, "nested at most 32 levels deep"),
-        ("metadata.seed", "[" * 100_000 + "]" * 100_000, "the JSON is broken .*recursion"),
         (
             "metadata.seed",
             f'"{"x" * 2**26}"',
@@ -80,11 +76,9 @@ def test_header_fields__refuse_other_types_and_ranges(path, text, message):
     ("path", "text", "message"),
     [
         ("name", '"\\u001b[2J"', "` must have a printable `name`"),
-        ("name", '"\\ud800"', "` must have a printable `name`"),
         ("width", "32.5", ".width` must be an integer from 1 to 2^26, got 32.5"),
         ("height", "1000000", "` must have a printable `name`, at most 2^26 pixels"),
         ("near", "0", ".near` must be a number from 1e-12 to 1e12, got 0"),
-        ("K", "[[1,0,0],[0,1,0]]", ".K` must be three lists of three numbers"),
         ("K.0.0", "1e300", "` must have a printable `name`, at most 2^26 pixels, and `K` [3][3]"),
         (
             "viewmat",
@@ -92,28 +86,13 @@ def test_header_fields__refuse_other_types_and_ranges(path, text, message):
             "` must have a printable `name`, at most 2^26 pixels, and `K` [3][3]",
         ),
         ("viewmat.2.1", "[1]", ": `matrix` must be an array of real numbers"),
-        ("background", "7", ".background` must be a PNG image of"),
         ("background", '"aGFs"', ".background` must be a PNG image of"),
-        ("background", f'"{encoded(SMALL)}"', ".background` must be a PNG image of"),
         ("background", f'"{encoded(FITTING, jpeg_bytes)}"', ".background` must be a PNG image of"),
     ],
 )
 def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path, text, message):
     with pytest.raises(ValueError, match=re.escape(f"cameras[0]{message}")):
         header_fields(with_entry(f"cameras.0.{path}", text))
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"", "the JSON is broken"),
-        (b"\xff\xfe", "the JSON is broken .'utf-8'"),
-        (b"[1]", "`cameras` must be a list of at least one camera"),
-    ],
-)
-def test_header_fields__refuse_other_json(data, message):
-    with pytest.raises(ValueError, match=message):
-        header_fields(data)
 
 
 def test_header__has_the_images_behind_the_gaussians():
@@ -179,11 +158,3 @@ def test_load_json__accepts_what_is_within_its_limits():
         -(2**63),
         1e308,
     ]
-
-
-def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(tmp_path):
-    large = Camera(CAMERAS[0].K, CAMERAS[0].viewmat, 2**14, 2**14)
-    message = r"a reader would refuse .* `cameras\[0\]` must have .* at most 2\^26 pixels"
-    with pytest.raises(ValueError, match=message):
-        StreamWriter(tmp_path / "s", [large], 25)
-    assert not (tmp_path / "s").exists()

@@ -56,9 +56,14 @@ def test_residual_packet__of_a_decoded_state_reproduces_it():
 def test_decode__ids_follow_a_gaussian_from_birth_to_death():
     first = cloud(6)
     state = decode(None, keyframe_packet(first, 0, CAMERAS))
-    marked = Gaussians.concatenate([state.gaussians.select(np.array([0, 2, 5])), single_at(7.0)])
+    first_means = state.gaussians.numpy()["means"]
+    survivors = state.gaussians.select(np.array([0, 2, 5]))
+    moved = replace(survivors, means=survivors.numpy()["means"] + 0.1)
+    marked = Gaussians.concatenate([moved, single_at(7.0)])
     state = decode(state, residual_packet(state, marked, np.array([0, 2, 5, -1]), CAMERAS))
     assert state.ids.tolist() == [0, 2, 5, 6]
+    moves = state.gaussians.numpy()["means"][:3] - first_means[[0, 2, 5]]
+    assert_array_equal(state.gaussians.numpy()["motion"][:3], moves)
     again = Gaussians.concatenate(
         [state.gaussians.select(np.array([1, 2])), single_at(8.0), single_at(9.0)]
     )
@@ -83,12 +88,6 @@ def test_decode__round_trips_every_degree_with_and_without_confidence(degree, co
     assert result.gaussians.sh_degree == degree
     assert (result.gaussians.logit_confidence is not None) == confidence
     assert_close(result.gaussians.numpy()["sh_coeffs"], target.numpy()["sh_coeffs"], atol=0.02)
-
-
-def test_residual_packet__removes_all_gaussians():
-    state = decode(None, keyframe_packet(cloud(5), 0, CAMERAS))
-    new_state = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
-    assert (new_state.ids.tolist(), new_state.next_id) == ([5], 6)
 
 
 def with_head(packet, *head):
@@ -119,14 +118,9 @@ def with_array(packet, name, array):
             lambda _, residual: with_head(residual, 0, 81),
             r"'quantizer_step': 80}, got \[0, 81\]",
         ),
-        (lambda key, _: with_array(key, "offset", key.arrays["code"]), "expected the arrays"),
         (
             lambda key, _: with_array(key, "code", key.arrays["code"][None]),
             r"expected the arrays .* 'code': 'uint32 \[1, \d+\]'",
-        ),
-        (
-            lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)),
-            r"expected the arrays .* got {'parent': 'uint32 \[n\]'",
         ),
         (
             lambda _, residual: replace(residual, frame=0),

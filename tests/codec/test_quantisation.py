@@ -1,7 +1,5 @@
 """Steps of the quantised numbers: bounded errors, extremes, and the bytes that they take."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +14,7 @@ from morgs_mi.codec.packets import (
 )
 from morgs_mi.core.attributes import BY_NAME
 from morgs_mi.core.gaussians import Gaussians
-from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jittered
+from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
 
 def test_residual_packet__errors_stay_within_the_tolerance():
@@ -102,16 +100,6 @@ def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step():
     result = decode(state, residual_packet(state, Gaussians(**raw), None, CAMERAS, config))
     assert np.flatnonzero((result.grid.values != state.grid.values).any(1)).tolist() == [7, 8, 17]
     assert np.flatnonzero(result.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
-
-
-def test_grid__stores_the_attribute_of_a_new_row_of_the_table():
-    """One more row with an `error` and a field of that name; streams without the attribute stay the
-    same.
-    """
-    command = [sys.executable, "-m", "tests.codec.new_row"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip() == history(encoded_clip(4)[1])
 
 
 def test_residual_packet__follows_a_turn_of_any_angle():

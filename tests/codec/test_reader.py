@@ -89,9 +89,8 @@ def test_stream_reader__reports_a_lost_connection_after_complete_frames():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frames", [60, pytest.param(300, marks=pytest.mark.long)])
-def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path, frames):
-    packets, states = encoded_clip(frames, degree=0)
+def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path):
+    packets, states = encoded_clip(60, degree=0)
     write(tmp_path / "s", packets, states, every=50)
     program = f"""
 import drjit as dr
@@ -110,7 +109,7 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
     expected = history(states)
     assert result.stdout.strip() == expected
     assert history(coded_frames(StreamReader(tmp_path / "s"))) == expected
-    assert_same(StreamReader(tmp_path / "s").seek(frames - 1), states[-1])
+    assert_same(StreamReader(tmp_path / "s").seek(59), states[-1])
 
 
 @pytest.mark.parametrize(

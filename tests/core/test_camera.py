@@ -109,11 +109,9 @@ def test_camera__copies_its_matrices():
     [
         ({"near": np.nan}, r"`near` must be a number in \[1e-30, inf\), got nan"),
         ({"delay": 1.5}, r"`delay` must be a number in \[-1, 1\], got 1.5"),
-        ({"width": 8.5}, "at least 1x1 in integers, got 8.5x16"),
         ({"K": np.eye(2)}, r"`K` must be an array of real numbers \[3, 3\]"),
         ({"K": K + np.eye(3, k=1)}, "a camera without skew"),
         ({"K": -K}, "positive focal lengths"),
-        ({"K": K * [[1e-30, 1, 1], [1, 1, 1], [1, 1, 1]]}, "positive focal lengths"),
         ({"viewmat": VIEWMAT * np.nan}, r"Camera\(\), `viewmat`: the pose must be finite"),
         (
             {"viewmat": np.diag([1, 1, 1, 1e308])},
@@ -124,7 +122,6 @@ def test_camera__copies_its_matrices():
             {"viewmat": np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]])},
             "transpose the matrix if",
         ),
-        ({"viewmat": VIEWMAT * 1j}, "got complex128"),
     ],
 )
 def test_camera__refuses_bad_input(change, message):
@@ -136,7 +133,6 @@ def test_camera__refuses_bad_input(change, message):
     ("change", "message"),
     [
         ({"target": (0, -3, 0)}, "`up` must not be parallel"),
-        ({"origin": (0, 0)}, r"`origin` must be an array of real numbers \[3\], got int64 \[2\]"),
         ({"fov_x": 180}, r"`fov_x` must be a number in \(0, 180\), got 180"),
     ],
 )
@@ -157,8 +153,3 @@ def test_look_at__refuses_bad_input(change, message):
 def test_look_at__has_a_near_plane_before_its_target(distance, near):
     camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
     assert camera.near == pytest.approx(near)
-
-
-def test_repr__has_name_size_and_place():
-    camera = Camera.look_at((0, -4, 1.25), (0, 0, 0), (0, 0, 1), 40, 64, 48, "cam00")
-    assert repr(camera) == "Camera('cam00', 64x48, 40 degrees across, at (0, -4, 1.25))"

@@ -13,7 +13,6 @@ from morgs_mi.core.color_space import (
     display_stops,
     encode_light,
     encode_traced,
-    unit_values,
 )
 
 A = 1.055 / 2.4
@@ -60,17 +59,6 @@ def test_encode_traced__agrees_with_numpy_in_value_and_slope(traced, curve):
     result = traced(white)
     dr.forward(white)
     assert dr.grad(result)[0] == pytest.approx(A if traced is encode_traced else 1 / A, rel=1e-4)
-
-
-def test_encode_traced__returns_the_bytes_of_mitsubas_srgb_up_to_white():
-    x = mi.Float(np.linspace(0, 1, 4097).astype(np.float32))
-    assert_array_equal(encode_traced(x).numpy(), mi.math.linear_to_srgb(x).numpy())
-    assert_array_equal(decode_traced(x).numpy(), mi.math.srgb_to_linear(x).numpy())
-
-
-def test_unit_values__divides_bytes_alone():
-    assert_array_equal(unit_values(np.uint8([[0, 51, 255]])), [[0, 0.2, 1]])
-    assert_array_equal(unit_values(np.float32([[0, 0.5, 3]])), [[0, 0.5, 3]])
 
 
 def test_display_image__brightens_by_stops_and_clips():

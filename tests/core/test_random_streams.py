@@ -7,7 +7,3 @@ def test_rng_of__streams_never_collide():
     keys = list(product(range(3), Stream, range(15)))
     first = [tuple(rng_of(*key).integers(0, 2**63, 2).tolist()) for key in keys]
     assert len(set(first)) == len(keys)
-
-
-def test_rng_of__repeats_a_stream():
-    assert rng_of(3, Stream.LATER_FRAMES, 7).random() == rng_of(3, Stream.LATER_FRAMES, 7).random()
