@@ -10,10 +10,9 @@ from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.core.view import View
-from morgs_mi.fit.balance import Balance, balance_cameras, short_fit_config
+from morgs_mi.fit.balance import balance_cameras, short_fit_config
 from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.method.exposure import Exposure
 from morgs_mi.platform.progress import Progress
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic
@@ -95,17 +94,3 @@ def test_short_fit_config__takes_at_most_a_quarter_of_the_steps_of_the_first_fra
     assert short_fit_config(FIT).first_frame_steps == 100
     assert short_fit_config(replace(FIT, first_frame_steps=40)).first_frame_steps == 10
     assert short_fit_config(replace(FIT, first_frame_steps=1)).first_frame_steps == 1
-
-
-@pytest.mark.slow
-def test_balance_cameras__does_not_judge_where_balanced_cameras_are_wanted():
-    balance = balanced(GAINS, replace(FIT, exposure="on"))
-    assert balance.taken
-    assert np.isnan(balance.recorded_psnr)
-
-
-def test_balance__sentence_names_the_largest_change():
-    balance = Balance((Exposure((1.1, 1, 1)), Exposure()), True)
-    assert (
-        balance.sentence == "The cameras were balanced: exposures differ by up to 9.0 % of white."
-    )

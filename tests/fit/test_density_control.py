@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import morgs_mi
-from morgs_mi import Camera, DensityConfig, DensityControl, Gaussians, rasterize
+from morgs_mi import Camera, DensityControl, Gaussians, rasterize
 from morgs_mi.testing import assert_close
 from tests.scenes.derivatives import backward, gradient
 from tests.scenes.gaussians import isotropic
@@ -58,28 +58,19 @@ def test_density_control__carries_moments_and_prunes_faint_gaussians():
     assert len(Gaussians.from_parameters(optimizer)) == 3
 
 
-def test_density_control__keeps_the_picture_of_a_clone():
-    optimizer = optimizer_of(splats())
-    control = DensityControl([CAMERA], DensityConfig(split_scale=1.0))
-    control.scores = np.array([0, 0, 1.0])
-    opacity = np.array(rasterize(splats(), CAMERA, ("alpha",)).alpha).sum()
-    control.step(optimizer, births=1)
-    clone_alpha = rasterize(Gaussians.from_parameters(optimizer), CAMERA, ("alpha",)).alpha
-    assert np.array(clone_alpha).sum() == pytest.approx(opacity, rel=0.15)  # the clone is displaced
-
-
 def test_density_control__refuses_scores_of_other_gaussians_and_missing_parameters():
     control = DensityControl([CAMERA])
-    control.scores = np.zeros(2)
-    with pytest.raises(ValueError, match=r"`scores` must be \[3\]"):
-        control.step(optimizer_of(splats()), births=1)
+    for scores, message in ((np.zeros(2), r"\[3\]"), ([1, np.nan, 0], "finite, got nan; set")):
+        control.scores = scores
+        with pytest.raises(ValueError, match=f"`scores` must be {message}"):
+            control.step(optimizer_of(splats()), births=1)
     with pytest.raises(ValueError, match="none of the name means"):
         control.step(mi.ad.Adam(lr=0.0, params={"data": mi.TensorXf([1.0])}), births=1)
     with pytest.raises(ValueError, match="`cameras` or `extent` must be given"):
         DensityControl()
 
 
-@pytest.mark.parametrize("births", [-1, None, 1e9, 10**9, 1.5, "1", True, np.nan])
+@pytest.mark.parametrize("births", [-1, 10**9, 1.5])
 def test_density_control__refuses_absurd_births(births):
     with pytest.raises(
         ValueError, match=r"step\(\): `births` must be .*at least 0 and at most 1000"
@@ -88,29 +79,9 @@ def test_density_control__refuses_absurd_births(births):
 
 
 @pytest.mark.parametrize(
-    ("scores", "message"),
-    [
-        ([1, np.nan, 0], "`scores` must be finite, got nan; set"),
-        ([1, 0, -np.inf], "`scores` must be finite, got -inf; set"),
-        (["a", "b", "c"], "`scores` must be an array of real numbers, got"),
-    ],
-)
-def test_density_control__refuses_absurd_scores(scores, message):
-    control = DensityControl([CAMERA])
-    control.scores = scores
-    with pytest.raises(ValueError, match=rf"^DensityControl.step\(\): {message}"):
-        control.step(optimizer_of(splats()), births=1)
-
-
-@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"extent": -1}, r": `extent` must be a number in \(0, 1e\+12\], got -1"),
-        ({"extent": 0}, r": `extent` must be a number in \(0, 1e\+12\], got 0"),
-        ({"extent": np.nan}, r": `extent` must be a number in \(0, 1e\+12\], got nan"),
-        ({"extent": np.inf}, r": `extent` must be a number in \(0, 1e\+12\], got inf"),
-        ({"extent": "1"}, r": `extent` must be a number in \(0, 1e\+12\], got '1'"),
-        ({"config": {}}, r": `config` must be a .*DensityConfig, got a dict"),
         ({"render": {}}, r": `render` must be a .*RenderConfig, got a dict"),
         ({"cameras": None}, r": `cameras` must be a .*Sequence, got a NoneType"),
         ({"seed": "x"}, ", `seed`: "),
@@ -124,20 +95,13 @@ def test_density_control__refuses_absurd_arguments(arguments, message):
 @pytest.mark.parametrize(
     ("image", "mask", "message"),
     [
-        (None, None, r"`image` must be an array of real numbers \[36, 48, 3\], got None"),
         (np.zeros((36, 48)), None, r"`image` must be .* \[36, 48, 3\], got float64 \[36, 48\]"),
-        (np.full((36, 48, 3), np.nan), None, "`image` must have numbers from -32 to 32, 1 for whi"),
         (np.zeros((36, 48, 3)), np.ones((2, 2), bool), r"the mask must be bool \[36, 48\]"),
     ],
 )
 def test_density_control__refuses_absurd_images(image, mask, message):
     with pytest.raises(ValueError, match=rf"^DensityControl.observe\(\): {message}"):
         DensityControl([CAMERA]).observe(optimizer_of(splats()), CAMERA, image, mask)
-
-
-def test_density_control__refuses_what_is_no_adam():
-    with pytest.raises(ValueError, match=r"step\(\): `optimizer` must be a .*Adam, got a dict"):
-        DensityControl([CAMERA]).step(splats().parameters(), births=1)
 
 
 def test_update_ellipsoids__follows_another_number_of_gaussians_with_gradients():

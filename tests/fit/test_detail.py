@@ -9,7 +9,7 @@ from morgs_mi.fit import budget
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.detail import count_details
 from morgs_mi.fit.fit_config import FitConfig
-from tests.scenes.cameras import arc, look_at_cameras
+from tests.scenes.cameras import look_at_cameras
 
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
 
@@ -68,12 +68,3 @@ def test_plan_first_frame__counts_what_several_views_see_once():
     points = np.concatenate([POINTS, POINTS + np.array([9, 0, 0])])
     assert mean_views(beside, points) == 1
     assert count(beside, image, points) == 2 * one
-
-
-def test_plan_first_frame__stays_within_its_limits(monkeypatch):
-    cameras = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60)
-    image = texture()
-    for limit, value in (("LEAST_GAUSSIANS", 5000), ("MOST_GAUSSIANS", 20)):
-        with monkeypatch.context() as context:
-            context.setattr(budget, limit, value)
-            assert count(cameras, image, POINTS) == value

@@ -9,14 +9,11 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import seen_points
 from morgs_mi.fit.features import (
     Features,
-    Match,
-    SharedFeatures,
     detect,
     match_views,
 )
 from morgs_mi.testing import assert_close
 from tests.scenes import textured
-from tests.scenes.cameras import look_at_cameras
 
 
 def test_match_views__returns_none_for_matches_without_a_common_geometry():
@@ -32,23 +29,6 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
     ]
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
     assert match_views(features, [camera, camera]).matches == ()
-
-
-def test_reprojection_errors__are_bounded_by_epipolar_distances():
-    """No point can be nearer to both features than half their distance to the epipolar lines, which
-    are the rows of cameras side by side.
-    """
-    rng = np.random.default_rng(0)
-    cameras = [look_at_cameras([(x, 0, -4)], target=(x, 0, 0))[0] for x in (0, 0.5)]
-    points = rng.uniform(-0.8, 0.8, (50, 3))
-    pixels = [camera.project(points)[0] for camera in cameras]
-    distance = rng.uniform(0, 5, 50)
-    pixels[1][:, 1] += distance
-    features = tuple(Features(p, np.zeros((50, 128)), np.zeros((50, 3)), p) for p in pixels)
-    match = Match((0, 1), np.tile(np.arange(50)[:, None], 2))
-    errors = SharedFeatures(features, (match,)).reprojection_errors(match, cameras)
-    assert (errors >= 0.45 * distance - 1e-6).all()
-    assert (errors <= 2 * distance + 1e-6).all()
 
 
 def test_detect__finds_a_blob_at_its_position():

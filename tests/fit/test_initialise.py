@@ -50,14 +50,6 @@ def test_fill_points__adds_points_at_the_depth_of_the_others_where_views_show_no
     assert np.abs(filled[~added, 2] - 2).max() < 1e-6
 
 
-def test_fill_points__adds_none_where_pixels_are_not_valid():
-    points, views = few_points()
-    views = [grey_view(view.camera, np.zeros(view.image.shape[:2], bool)) for view in views]
-    filled, filled_colors = fill_points(points, views, 100, np.random.default_rng(1))
-    assert len(filled) == 100
-    assert_allclose(filled_colors, 0.8)
-
-
 @pytest.mark.parametrize("count", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
 def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(count):
     (points, colors), views = few_points()
@@ -68,6 +60,13 @@ def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(cou
     expected = 1 if count < MIN_POINTS else 0.3 if count < 1000 else 0
     assert random.mean() >= expected
     assert (random.mean() > 0) == (expected > 0)
+
+
+def test_in_empty_space__is_before_the_near_plane_of_any_camera():
+    cameras = [replace(c, near=1.0) for c in look_at_cameras([(0, 0, -3), (0, 0, 3)], 60)]
+    means = np.array([(0, 0, -2.5), (0, 0, -1.5), (0, 0, -3.5), (0.2, 0, 2.5), (0.7, 0, -2.5)])
+    assert in_empty_space(cameras, means).tolist() == [True, False, False, True, False]
+    assert not in_empty_space([], means).any()
 
 
 @pytest.mark.parametrize("count", [0, 40, 2000])
@@ -172,23 +171,11 @@ def test_border_color__is_what_borders_have_in_common():
         replace(view, image=view.image + rng.normal(0, 0.1, view.image.shape)) for view in views
     ]
     assert border_color(noisy) is None
-    coloured = red_ball_views((0.9, 0.8, 0.7))
-    for k, view in enumerate(coloured):
-        view.image[:] *= 1 - 0.1 * k
-    assert border_color(coloured) is None
     masks = [np.zeros(view.image.shape[:2], bool) for view in views]
     for mask in masks:
         mask[20:30, 20:30] = True
     masked = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
     assert border_color(masked) is None
-
-
-def test_seen_points__leaves_out_points_behind_and_beside_the_camera():
-    (camera,) = look_at_cameras([(0, 0, -3)], 60)
-    mask, pixels, depths = seen_points(camera, np.array([(0, 0, 0), (0, 0, -6), (9, 0, 0)]))
-    assert mask.tolist() == [True, False, False]
-    assert_allclose(pixels, [(camera.width / 2, camera.height / 2)])
-    assert_allclose(depths, [3])
 
 
 def test_in_light__points_get_the_median_colours_of_hdr_views():
@@ -204,27 +191,20 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
     points = PointCloud(np.concatenate([cube, outside]), np.full((31, 3), 0.75))
     expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
     assert_allclose(_in_light(points, views).colors, expected)
-    assert (
-        _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras])
-        is points
-    )
 
 
 @pytest.mark.parametrize(
     ("change", "share"),
     [
         (lambda points: points, None),
-        (lambda points: points[:0], None),
         (lambda points: points - np.array([0, 0, 100]), 0),  # behind the cameras
-        (lambda points: points + np.array([50, 0, 0]), 0),  # beside the views
         (lambda points: np.where(np.arange(len(points))[:, None] % 25, 50, points), 4),
         (lambda points: np.where(np.arange(len(points))[:, None] % 10, 50, points), None),
     ],
 )
-@pytest.mark.parametrize("count", [1, 500])
-def test_unseen_points__names_points_that_hardly_a_camera_sees(change, share, count):
+def test_unseen_points__names_points_that_hardly_a_camera_sees(change, share):
     cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
-    points = change(np.tile(np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3)), (count, 1)))
+    points = change(np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3)))
     start = "" if share is None else f"the cameras see {share} % of the {len(points)} points, which"
     sentence = unseen_points(cameras, points)
     assert sentence.startswith(start)

@@ -40,19 +40,6 @@ def test_optimise__minimises_the_weighted_sum(decay):
     assert_close(values_of(both)["x"], np.full(4, 2.0), atol=0.02)
 
 
-def test_optimise__steps_are_as_long_as_the_rate():
-    """Adam's steps have the length of the rate, from the first to the last."""
-    start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
-    path = []
-
-    def slope(values, view):
-        path.append(np.asarray(dr.detach(values["x"])).item())
-        return {"slope": dr.sum(values["x"], axis=None)}
-
-    optimise(adam(start), {"x": 0.5}, slope, Steps([0] * 12))
-    assert_close(np.diff(path), np.full(11, -0.5), rtol=1e-3)
-
-
 @pytest.mark.parametrize(("momentum", "needed"), [(0.9, 3), (0.5, 1)])
 def test_adam__momentum_delays_a_reversal(momentum, needed):
     """With less momentum, fewer opposite gradients reverse the steps."""
@@ -99,19 +86,6 @@ def test_fit_problem__names_images_that_are_worse_than_constant_ones(psnr, error
     sentence = fit_problem(psnr, errors)
     assert sentence.startswith(start)
     assert bool(sentence) == bool(start)
-
-
-def test_optimise__continues_where_it_ended():
-    """Twelve steps in one go and in two are the same steps."""
-    ends = []
-    for stages in ([12], [5, 7]):
-        optimizer = adam({"x": mi.TensorXf(np.zeros(3, np.float32))})
-        step = 0
-        for length in stages:
-            optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * length, step, lambda step: 0.9**step))
-            step += length
-        ends.append(np.asarray(values_of(optimizer)["x"]))
-    assert np.array_equal(*ends)
 
 
 def test_replace_parameter__keeps_moments():

@@ -1,7 +1,5 @@
 """The problem of a first frame, and the views that it consists of."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -69,16 +67,6 @@ def test_mean_psnr__does_not_count_masked_pixels():
     assert masked[0] == masked[1] > mean_psnr(ball(80), unmasked_views, RenderConfig()) + 3
 
 
-@pytest.mark.filterwarnings("error")
-def test_mean_psnr__leaves_out_views_without_valid_pixels():
-    images = bytes_of(images_of(opaque_ball()))
-    first, *others = problem(images).views
-    none = replace(first, mask=np.zeros((48, 64), bool))
-    scores = [mean_psnr(ball(80), some, RenderConfig()) for some in (others, (none, *others))]
-    assert scores[0] == scores[1]
-    assert np.isnan(mean_psnr(ball(80), [none], RenderConfig()))
-
-
 @pytest.mark.parametrize(
     ("width", "size"),
     [(160, (160, 120)), (81, (160, 120)), (80, (80, 60)), (50, (53, 40)), (10, (160, 120))],
@@ -106,12 +94,6 @@ def test_withheld_blocks__divide_the_valid_pixels():
         assert_array_equal(a.mask ^ b.mask, allowed)
         assert not (a.mask & b.mask).any()
         assert b.mask.sum() / allowed.sum() == pytest.approx(1 / 8, abs=0.06)
-
-
-def test_withheld_blocks__reduce_each_view_to_the_least_width():
-    views = [large_view(), large_view().reduced(80), large_view()]
-    rest, _ = withheld_blocks(views, 80, np.random.default_rng(0))
-    assert [view.camera.width for view in rest] == [80, 80, 80]
 
 
 def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 
 from morgs_mi.core.rig import seen_points
 from morgs_mi.fit.stereo import stereo_points
@@ -35,11 +34,6 @@ def test_stereo_points__lie_on_the_surfaces(views, points_and_colors):
     mask, pixels, _ = seen_points(views[0].camera, points)
     columns, rows = pixels.astype(int).T
     assert np.median(np.abs(views[0].image[rows, columns] / 255.0 - colors[mask])) < 0.05
-
-
-@pytest.mark.slow
-def test_stereo_points__are_the_same_every_time(views, points_and_colors):
-    assert_array_equal(points_and_colors[0], dense(views)[0])
 
 
 @pytest.mark.slow

@@ -55,10 +55,6 @@ def test_union__is_the_blocks_that_the_chosen_boxes_touch(boxes):
         assert blocks.sum() == blocks[:rows, :columns].sum()
 
 
-def test_union__of_no_boxes_is_empty(boxes):
-    assert not boxes.union(np.zeros(50, bool)).any()
-
-
 @pytest.mark.parametrize("factor", [1, 2])
 def test_within__counts_pixels_in_the_blocks_of_reduced_views(boxes, factor):
     rng = np.random.default_rng(2)

@@ -153,29 +153,6 @@ def draw_moving_patch(image, next_image, shift, rng):
     next_image[34:66, 54 + shift : 86 + shift] = patch
 
 
-@pytest.mark.parametrize("with_masks", [False, True])
-def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_masks):
-    """Inside a patch that moves by 4 px."""
-    rng = np.random.default_rng(4)
-    image = noisy_image(rng)
-    next_image = noisy_image(rng)
-    draw_moving_patch(image, next_image, 4, rng)
-    box = box_around(changed(image, next_image))
-    masks = "grabcut" if with_masks else None
-    observations = [
-        observe_key_views({0: FramePair(next_image, image, box=b)}, "dis", masks)[0]
-        for b in (None, box)
-    ]
-    whole, part = (observation.motion[40:60, 64:84] for observation in observations)
-    assert np.median(whole, axis=(0, 1)) == pytest.approx((4, 0), abs=0.2)
-    assert np.median(np.linalg.norm(whole - part, axis=-1)) < 0.2
-    outside = np.ones((H, W), bool)
-    outside[box] = False
-    assert outside.any()
-    assert not observations[1].reliable[outside].any()
-    assert not observations[1].motion[outside].any()
-
-
 def test_observe_key_views__what_has_not_changed_has_not_moved():
     """Flow bleeds over the edges of a patch that moves by 6 px before a plain wall."""
     rng = np.random.default_rng(9)

@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
-from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
-from morgs_mi.method.flow import observe_key_views
-from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from tests.method.moving_disc import moving_disc, observed
 
@@ -33,22 +30,6 @@ def test_motion_mask__finds_a_moving_disc(method, shift):
     # that much.
     assert iou(mask, disc) > (48 / 52) ** 2 - 0.1
     assert mask[disc].mean() > 0.95
-
-
-def test_motion_mask__passes_its_config_to_threshold_and_refiner():
-    previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
-    method = "grabcut"
-    observation = observe_key_views({7: FramePair(image, previous)}, "dis", method)[7]
-    motion = observation.motion
-    reliable = observation.reliable
-    for config in (CONFIG, MaskConfig(floor=20)):
-        flow = flow_mask(motion, reliable, config)
-        expected = MASK_REFINERS.make(method, config)(image, flow)
-        mask = motion_mask(image, motion, reliable, method, config)
-        assert_array_equal(mask, expected)
-        assert np.array_equal(mask, observation.mask) == (config is CONFIG)
-    assert not (flow_mask(motion, reliable, CONFIG) & ~observation.mask).any()
-    assert observed(image, previous).mask is None
 
 
 def test_flow_threshold__follows_width_and_noise():

@@ -82,12 +82,6 @@ def test_error_per_gaussian__ignores_noise():
     assert scores[~near].max() < DensityConfig().min_error
 
 
-def test_error_per_gaussian__without_a_step_is_zero():
-    scores = ErrorPerGaussian(3)
-    scores.collect()
-    assert not np.asarray(scores.scores).any()
-
-
 def test_error_per_gaussian__skips_the_first_steps():
     scores = ErrorPerGaussian(3, skip=2)
     rendered = []

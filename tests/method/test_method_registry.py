@@ -57,26 +57,6 @@ def test_registry__rejects_bad_and_taken_names(registry, name, message):
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("flow_method", "diss"),
-        ("mask_method", "sam"),
-        ("model", "mesh"),
-    ],
-)
-def test_motion_config__refuses_names_that_are_not_registered(setting, value):
-    with pytest.raises(
-        ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of .*, got '{value}'\.$"
-    ):
-        morgs_mi.MotionConfig(**{setting: value})
-
-
-def test_motion_config__accepts_arguments_whose_files_are_not_there_yet():
-    config = morgs_mi.MotionConfig(flow_method="files:none", mask_method="sam2:a.onnx,b.onnx")
-    assert config.flow_method == "files:none"
-
-
-@pytest.mark.parametrize(
     ("page", "registry", "line"),
     [("flow.md", FLOW_SOURCES, "`{}`"), ("masks.md", MASK_REFINERS, "- `{}`: ")],
 )

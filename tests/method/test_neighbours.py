@@ -16,8 +16,3 @@ def test_nearest__are_the_nearest_others_in_order(count):
     index = NeighbourIndex(POINTS)
     assert_array_equal(index.nearest(count), expected)
     assert_array_equal(index.nearest(count, np.array([4, 2])), expected[[4, 2]])
-
-
-def test_nearest__has_none_for_a_single_point():
-    assert NeighbourIndex(POINTS[:1]).nearest(8).shape == (1, 0)
-    assert NeighbourIndex(POINTS[:1]).nearest(8, np.arange(0)).shape == (0, 0)

@@ -151,8 +151,6 @@ def test_loss_term__acts_where_its_observation_exists(registry):
     ("terms", "message"),
     [
         (("fast:1",), r"ObjectiveConfig\(\): `terms` must be one of speed:WEIGHT, got 'fast:1'"),
-        (("speed",), "must be one of speed:WEIGHT, got 'speed'"),
-        (("speed:much",), r"`terms` must be a number in \[0, inf\), got 'much'"),
         (("speed:-1",), r"`terms` must be a number in \[0, inf\), got -1.0"),
         (("speed:1", "speed:2"), "must name each term once"),
         ("speed:1", "`terms` must be a list"),
@@ -164,20 +162,11 @@ def test_objective_config__refuses_terms(registry, terms, message):
         ObjectiveConfig(terms=terms)
 
 
-def test_objective_config__refuses_terms_where_none_is_registered(registry):
-    with pytest.raises(
-        ValueError, match="`terms` must be one of the registered names, of which there are none"
-    ):
-        ObjectiveConfig(terms=("speed:1",))
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("flow", "which the objective has already"),
-        ("mse", "which the objective has already"),
         ("speed", "a new name"),
-        ("a:b", "colon"),
     ],
 )
 def test_loss_term__refuses_names(registry, name, message):

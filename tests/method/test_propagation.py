@@ -80,28 +80,8 @@ def test_propagate_motion__spreads_no_wrong_motion(scene):
     assert not displacement[~wrong].any()
 
 
-def test_propagate_motion__keeps_true_motion(scene):
-    moves = scene[1]
-    assert found(start(scene, lift_of(moves)), moves)[0] > 0.96
-
-
-def test_propagate_motion__does_nothing_without_motion_or_views(scene):
-    gaussians, _, views = scene
-    lifted = still(460)
-    rng = np.random.default_rng(0)
-    assert propagate_motion(MotionProblem(gaussians, views, rng), lifted) is lifted
-    assert propagate_motion(MotionProblem(gaussians, {}, rng), lifted) is lifted
-
-
 def test_propagate_motion__does_nothing_where_no_view_shows_what_may_move(scene):
     gaussians, moves, views = scene
     outside = replace(gaussians, means=np.asarray(gaussians.means) - np.float32([0, 0, 50]))
     lifted = lift_of(moves)
     assert start((outside, moves, views), lifted) is lifted
-
-
-def test_propagate_motion__leaves_a_single_gaussian_without_neighbours_as_it_is(scene):
-    gaussians, _, views = scene
-    alone = MotionProblem(gaussians.select(np.array([0])), views, np.random.default_rng(0))
-    lifted = MotionStart(SHIFT[None], np.float32([2]))
-    assert np.array_equal(propagate_motion(alone, lifted).displacement, lifted.displacement)

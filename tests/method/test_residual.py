@@ -49,21 +49,17 @@ def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     displacement = m[:, None] * (R["motion"] + R["offset"])
     assert_close(current["motion"], displacement, atol=1e-6)
     assert_close(current["offset"], m[:, None] * R["offset"], atol=1e-6)
+    appearance = np.ones_like(m) if two_gates else m
+    R["sh_coeffs"] = np.concatenate([R["sh_dc"], *([R["sh_rest"]] if degree else [])], axis=1)
+    for name, gate in (
+        ("quats", m),
+        ("log_scales", appearance),
+        ("logit_opacities", appearance),
+        ("sh_coeffs", appearance),
+    ):
+        change = gate * R[name].T
+        assert_close(current[name] - old_values[name], change.T, atol=1e-6, name=name)
     assert_close(current["means"] - old_values["means"], displacement, atol=1e-6)
-    assert_close(current["quats"] - old_values["quats"], m[:, None] * R["quats"], atol=1e-6)
-    change = current["sh_coeffs"] - old_values["sh_coeffs"]
-    m = np.ones_like(m) if two_gates else m
-    assert_close(
-        current["log_scales"] - old_values["log_scales"], m[:, None] * R["log_scales"], atol=1e-6
-    )
-    assert_close(
-        current["logit_opacities"] - old_values["logit_opacities"],
-        m * R["logit_opacities"],
-        atol=1e-6,
-    )
-    assert_close(change[:, :1], m[:, None, None] * R["sh_dc"], atol=1e-6)
-    if degree:
-        assert_close(change[:, 1:], m[:, None, None] * R["sh_rest"], atol=1e-6)
 
 
 def test_residual_parameters__follow_the_modules():

@@ -1,7 +1,5 @@
 """Flow from files: reading inverts writing, and errors name the file."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -90,12 +88,9 @@ def flo(magic=202021.25, width=3, height=2, values=12):
     ("content", "message"),
     [
         (flo(magic=1.0), "begins with the float 202021.25, got b'"),
-        (b"", "begins with the float 202021.25"),
-        (flo()[:8], "12 bytes for 3x0 pixels, got 8"),
         (flo(values=11), "60 bytes for 3x2 pixels, got 56; the file may be cut short"),
         (flo(width=-3), "for -3x2 pixels"),
         (flo()[:-4] + np.float32(np.nan).tobytes(), "none at 1 of 6, the first at x=2, y=1"),
-        (flo()[:-4] + np.float32(1.7e9).tobytes(), "none at 1 of 6"),
     ],
 )
 def test_read_flow__rejects_a_broken_flo_file(tmp_path, content, message):
@@ -104,9 +99,7 @@ def test_read_flow__rejects_a_broken_flo_file(tmp_path, content, message):
         read_flow(tmp_path / "bad.flo")
 
 
-@pytest.mark.parametrize(
-    "names", [("B", "G", "R", "motion.X", "motion.Y"), ("X", "Y", "u", "v"), ("u",)]
-)
+@pytest.mark.parametrize("names", [("B", "G", "R", "motion.X", "motion.Y"), ("X", "Y", "u", "v")])
 def test_read_flow__rejects_channels_that_are_not_flow(tmp_path, names):
     # The renderer's motion points the other way, and the colours beside it are not flow.
     write_exr(tmp_path / "b.exr", dict.fromkeys(names, np.zeros((2, 2))))
@@ -141,26 +134,5 @@ def test_flow_source__rejects_missing_and_broken_files_and_other_sizes(
 ):
     for name in ("cam02/backward/a_1.exr", "cam02/backward/b_1.flo"):
         write_flow(folder / name, random_flow())
-    (folder / "cam03/backward").mkdir(parents=True)
-    (folder / "cam03/backward/1.exr").write_bytes(b"no image")
     with pytest.raises(exception, match=message):
         FLOW_SOURCES.make(f"files:{folder}")(pair)
-
-
-def test_flow_source__rejects_a_missing_folder(tmp_path):
-    with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
-        FLOW_SOURCES.make(f"files:{tmp_path / 'flow'}")
-
-
-def test_flow_source__lists_a_folder_again_only_for_a_file_that_was_added(folder, monkeypatch):
-    listed = []
-    iterdir = Path.iterdir
-    monkeypatch.setattr(Path, "iterdir", lambda path: [listed.append(path), *iterdir(path)][1:])
-    source = FLOW_SOURCES.make(f"files:{folder}")
-    for frame in (1, 2, 1, 2):
-        source(pair_of(frame=frame))
-    assert len(listed) == 2
-    write_flow(folder / "cam00" / "backward" / "v2_frame_0003.flo", random_flow())
-    write_flow(folder / "cam00" / "forward" / "v2_frame_0002.flo", random_flow())
-    source(pair_of(frame=3))
-    assert len(listed) == 4

@@ -33,19 +33,6 @@ def test_observe_key_views__motion_is_the_shift_on_frame_ts_grid():
     assert reliable[disc].mean() > 0.8
 
 
-def test_observe_key_views__uncovered_pixels_are_unreliable():
-    previous, image, disc = moving_disc(240, 320, shift=(10, 0))
-    reliable = observed(image, previous).reliable
-    uncovered = np.roll(disc, (0, -10), (0, 1)) & ~disc
-    assert reliable[uncovered].mean() < 0.5 < 0.95 < reliable.mean()
-
-
-def test_optical_flow__float_and_bytes_agree():
-    previous, image, _ = moving_disc(64, 96, shift=(2, 1))
-    as_bytes = [(frame * 255 + 0.5).astype(np.uint8) for frame in (image, previous)]
-    assert_array_equal(optical_flow(image, previous), optical_flow(*as_bytes))
-
-
 @pytest.mark.parametrize("method", FLOW_METHODS)
 @pytest.mark.parametrize("size", [(15, 40), (90, 16)])
 def test_optical_flow__is_finite_at_any_size(method, size):
@@ -60,14 +47,10 @@ def test_optical_flow__is_finite_at_any_size(method, size):
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
 def test_optical_flow__is_finite_with_nothing_to_match(method):
-    scene = (255 * texture(130, 150, seed=3)).astype(np.uint8)
-    image = scene[:60, :80]
+    image = (255 * texture(60, 80, seed=3)).astype(np.uint8)
     flat = np.full((60, 80, 3), 90, np.uint8)
-    textured_left = np.where(np.arange(80)[:, None] < 20, image, flat)
-    same = ((flat, flat), (textured_left, textured_left))
-    for previous, following in (*same, (flat, image), (image, flat), (image, scene[70:, 70:])):
-        flow = optical_flow(following, previous, method)
-        assert np.isfinite(flow).all()
+    for previous, following in ((flat, flat), (flat, image), (image, flat)):
+        assert np.isfinite(optical_flow(following, previous, method)).all()
     # Every method finds no motion between equal images; RLOF interpolates between sparse matches.
     assert np.abs(optical_flow(image, image, method)).max() < 0.1
 
