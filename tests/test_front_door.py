@@ -62,15 +62,6 @@ def test_front_door__examples_compile(name):
     ast.parse(code)
 
 
-@pytest.mark.parametrize(
-    "path", ["README.md", "notebooks/01_render.ipynb", "notebooks/02_stream.ipynb"]
-)
-def test_front_door__has_what_readme_and_notebooks_import(path):
-    text = (ROOT / path).read_text(encoding="utf-8")
-    assert "morgs_mi" in text
-    assert re.findall(r"(?:from|import) morgs_mi\.\w+", text) == []
-
-
 def test_front_door__reprs_are_short():
     stream = morgs_mi.open_stream(ROOT / "tests/codec/streams/version2.morgs")
     packet = next(iter(stream))

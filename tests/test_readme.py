@@ -67,7 +67,3 @@ def test_readme__names_commands_that_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"^ {4}make (\S+)", README, re.MULTILINE):
         assert f"\n{target}:" in makefile
-
-
-def test_readme__is_short():
-    assert len(README.splitlines()) <= 120

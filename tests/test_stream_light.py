@@ -71,37 +71,6 @@ def test_resume__continues_with_the_exposures_of_the_reports(auto_exposed, clip)
 
 
 @pytest.mark.slow
-def test_push__leaves_a_change_of_light_in_the_scene(clip):
-    _, _, reports = run([clip[0], brighter(clip[0], [0.8] * 4)], EXPOSED)
-    # All cameras see it: the stream becomes darker, and no exposure changes.
-    assert reports[1].exposures == reports[0].exposures
-    assert reports[1].num_bytes > 1000
-
-
-@pytest.mark.slow
-def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, monkeypatch):
-    _, plain, _ = run(clip)
-    # Their few short fits would find differences of 1 %.
-    monkeypatch.setattr("morgs_mi.fit.balance.LEAST_DIFFERENCE", 0.1)
-    _, packets, _ = run(clip, with_fit(EXPOSED, exposure="auto"))
-    assert [packet.encoded for packet in packets] == [packet.encoded for packet in plain]
-
-
-@pytest.mark.slow
-def test_push__reports_a_black_first_frame_and_a_cut(clip):
-    loop = new_loop(SHORT)
-    cut = np.stack(clip[1][:4])[:, ::-1, ::-1, ::-1]
-    frames = (np.zeros_like(cut), clip[0][:4], clip[1][:4], np.ascontiguousarray(cut))
-    statuses = [loop.push([*images])[1].status for images in frames]
-    assert [status.split(";")[0] for status in statuses] == [
-        "cam00, cam01, cam02, cam03: the image is black",
-        "ok",
-        "ok",
-        "the images show another scene than in the frame before",
-    ]
-
-
-@pytest.mark.slow
 def test_push__light_above_white_is_fitted_and_followed():
     """The wall of the scene shines with 1 to 20 times white; images, points and packets have
     encoded colours.

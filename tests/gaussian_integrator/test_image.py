@@ -60,13 +60,6 @@ def test_gaussian_splat__channels_agree_with_the_reference_under_their_exr_names
     assert fields == ["R", "G", "B", "A", "motion.X", "motion.Y", "confidence.Y", "depth.Y"]
 
 
-def test_gaussian_splat__writes_aovs_in_the_requested_order(raw):
-    scene = make_mitsuba_scene(to_gaussians(raw), aovs=" depth, motion ")
-    assert scene.integrator().aov_names() == ["depth.Y", "motion.X", "motion.Y"]
-    image = np.asarray(mi.render(scene))
-    assert_array_equal(image[..., 3:], plugin_image(raw, aovs=AOVS)[..., [6, 3, 4]])
-
-
 def test_gaussian_splat__supports_pixel_formats(raw):
     rgb = plugin_image(raw)
     luminance = plugin_image(raw, {"pixel_format": "luminance"}, aovs="confidence")
@@ -95,12 +88,6 @@ def test_gaussian_splat__supports_a_field_of_view_along_any_axis(raw, axis):
     }[axis]
     sensor = {"fov_axis": axis, "fov": float(np.rad2deg(2 * np.arctan(0.5 * extent / f)))}
     assert_close(plugin_image(raw, sensor=sensor), plugin_image(raw), atol=tol.IMAGE_ABS)
-
-
-def test_gaussian_splat__composites_over_the_background(raw):
-    image = plugin_image(raw, background={"type": "rgb", "value": [0.2, 0.5, 0.9]})
-    expected = rasterize_view(raw, make_sensor_camera(), (0.2, 0.5, 0.9))["color"]
-    assert_close(image, to_linear(expected), atol=tol.IMAGE_ABS)
 
 
 def test_gaussian_splat__composites_over_an_image(raw):

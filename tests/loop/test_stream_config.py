@@ -1,19 +1,13 @@
 """Settings: presets and rates."""
 
 from dataclasses import asdict
-from typing import get_args
 
 import pytest
 
 from morgs_mi.fit.fit_config import FitConfig, LearningRates
-from morgs_mi.loop.stream_config import PRESETS, PresetName, StreamConfig, apply_preset
+from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.platform.config import apply_values
 from morgs_mi.render.render_config import RenderConfig
-
-
-def test_PRESETS__have_the_names_of_the_option():
-    assert tuple(PRESETS) == get_args(PresetName)
 
 
 @pytest.mark.parametrize(
@@ -40,12 +34,6 @@ def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted
     assert (motion.lift_confidence, motion.two_gates) == (lifted, lifted)
     assert config.render == RenderConfig(first_order_motion=not lifted)
     assert (config.codec, config.seed) == (base.codec, 3)
-
-
-def test_apply_preset__overrides_earlier_settings_and_later_ones_override_it():
-    config = apply_preset(StreamConfig(fit=FitConfig(epochs=3)), "s")
-    assert config.fit.epochs == 5
-    assert apply_values(config, {"fit": {"epochs": 2}}).fit.epochs == 2
 
 
 def test_apply_preset__rejects_an_unknown_name():

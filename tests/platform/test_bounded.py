@@ -7,7 +7,6 @@ import tracemalloc
 import zipfile
 import zlib
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -99,22 +98,12 @@ CASES = {
         npy("(1000000000000, 17)"),
         "expected a NumPy array, got a broken file",
     ),
-    "npy of negative size": (
-        read_array,
-        npy("(-2, -3)"),
-        "expected a NumPy array, got a broken file",
-    ),
     "npy of objects": (
         read_array,
         npy("(1,)", "'|O'", b"cos\nsystem\n."),
         "Object arrays cannot be loaded",
     ),
     "npy of code": (read_array, npy("().__class__"), "expected a NumPy array, got a broken file"),
-    "npz in place of npy": (
-        read_array,
-        npz(npy("(6,)")),
-        "expected a NumPy array, got a broken file",
-    ),
     "npz bomb": (archived, npz(bytes(250_000_000)), "got a claim of 250000000 bytes of data.npy"),
     "npz of another name": (
         archived,
@@ -135,7 +124,6 @@ CASES = {
     ),
     "TOML of a long key": (read_toml, b"a" + b".a" * 20_000 + b"=1", "keys of at most 20 dots"),
     "TOML of a long number": (read_toml, b"a = 0x" + b"f" * 6000, "numbers below 1000 digits"),
-    "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
     "TOML of open strings": (
         read_toml,
         b'a = """' + b'\\"""' * 60_000,
@@ -156,25 +144,10 @@ CASES = {
         ply(BINARY + LARGE),
         "vertex.*early end-of-file",
     ),
-    "PLY of negative size": (
-        read_vertices,
-        ply(BINARY + LARGE.replace("9", "-9", 1)),
-        "expected a complete PLY file",
-    ),
     "PLY of empty lists": (
         read_vertices,
         ply(BINARY + "element face 3000000\nproperty list uchar int i\n" + LARGE, bytes(3_000_000)),
         "or has lists, as of the faces",
-    ),
-    "compressed PLY of many vertices": (
-        read_splats,
-        ply(
-            BINARY
-            + "element chunk 1\nproperty float min_x\n"
-            + LARGE.replace(" x", " packed_position"),
-            bytes(4),
-        ),
-        "vertex.*early end-of-file",
     ),
     "compressed PLY of empty rows": (
         read_splats,
@@ -183,11 +156,6 @@ CASES = {
             bytes(4),
         ),
         "expected a compressed PLY",
-    ),
-    "PLY without an element": (
-        read_vertices,
-        ply(BINARY + "property float x\n"),
-        "expected a complete PLY file",
     ),
     "EXR of many pixels": (read_exr, large_exr, "got a claim of 40000x40000 pixels of 1 channels"),
     "PNG of many pixels": (
@@ -266,11 +234,3 @@ def test_array_names__lists_an_archive_or_names_a_broken_one(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"a.npz: expected a NumPy archive, got a broken file"):
         array_names(tmp_path / "a.npz")
-
-
-def test_readers__accept_images_of_one_colour(tmp_path):
-    """They take many times the size of their files, which is not a claim."""
-    write_exr(tmp_path / "a.exr", {"a": np.zeros((1000, 1500))})
-    assert read_exr(tmp_path / "a.exr")["a"].shape == (1000, 1500)
-    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((2160, 3840, 3), np.uint8))
-    assert image(tmp_path / "0.png").width == 3840

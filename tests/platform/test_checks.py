@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.platform.checks import check_number, check_points
-from tests.scenes.recording import recording
 
 
 @pytest.mark.parametrize(
@@ -30,12 +29,3 @@ def test_check_number__accepts_the_numbers_of_the_interval(value, interval, good
 def test_check_points__accepts_none_and_integers():
     assert [v.shape for v in check_points("f()", [], [])] == [(0, 3), (0, 3)]
     assert check_points("f()", [[1, 2, 3]], [[0, 1, 1]])[0].tolist() == [[1, 2, 3]]
-
-
-@pytest.mark.parametrize("unit", [255, np.nan])
-def test_check_points__colours_out_of_range_are_refused_where_they_enter(unit):
-    points = np.zeros((4, 3))
-    colors = np.zeros((4, 3))
-    colors[2, 1] = unit
-    with pytest.raises(ValueError, match=r"`point_colors` must be in \[0, 1\], got .* at 2"):
-        recording(points=points, point_colors=colors)

@@ -23,12 +23,6 @@ def test_from_numpy__converts_to_the_type_in_aligned_memory(kind):
     assert array.__array_interface__["data"][0] % 64 == 0
 
 
-def test_from_numpy__accepts_empty_arrays_and_lists():
-    assert from_numpy(mi.TensorXf, np.zeros((0, 3))).shape == (0, 3)
-    assert dr.width(from_numpy(mi.UInt32, [])) == 0
-    assert list(from_numpy(mi.UInt32, [1, 2])) == [1, 2]
-
-
 def test_owned_copy__is_aligned():
     borrowed = mi.Float(np.arange(1001, dtype=np.float32)[1:])
     copy = np.asarray(owned_copy(borrowed))

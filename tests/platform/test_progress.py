@@ -2,9 +2,6 @@
 
 import io
 import sys
-from types import SimpleNamespace
-
-import pytest
 
 from morgs_mi.platform import progress
 from morgs_mi.platform.progress import Progress, ProgressBar, name_of, time_left
@@ -42,26 +39,6 @@ def test_progress_bar__writes_nothing_into_a_file(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     ProgressBar("Fitting").report("First frame", 1, 1)
     assert sys.stderr.getvalue() == ""
-
-
-def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
-    display = pytest.importorskip("IPython.display", reason="comes with the extra `notebooks`")
-    shown = []
-
-    def show(content, display_id):
-        assert display_id
-        shown.append(content.data)
-        return SimpleNamespace(update=lambda content: shown.append("updated: " + content.data))
-
-    monkeypatch.setattr(display, "display", show)
-    monkeypatch.setattr(progress, "is_notebook", lambda: True)
-    bar = ProgressBar("Fitting <arm>")
-    bar.report("First frame", 0.5, 3)
-    bar.report("First frame", 3, 3)
-    assert "Fitting &lt;arm&gt;" in shown[0]
-    assert 'value="0.5" max="3"' in shown[0]
-    assert shown[1].startswith("updated: ")
-    assert 'value="3" max="3"' in shown[1]
 
 
 def test_progress__reports_its_stage():

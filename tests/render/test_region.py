@@ -32,10 +32,10 @@ def raw():
 
 @pytest.fixture(scope="module")
 def mask(camera):
-    """A disc, a single pixel in another tile, and the lower right corner."""
+    """A disc, a single pixel in another tile, one at the lower edge, and the lower right corner."""
     y, x = np.mgrid[: camera.height, : camera.width]
     mask = (x - 30) ** 2 + (y - 20) ** 2 < 12**2
-    mask[70, 5] = mask[74, 100] = True
+    mask[70, 5] = mask[74, 50] = mask[74, 100] = True
     return mask
 
 

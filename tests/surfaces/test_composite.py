@@ -124,25 +124,6 @@ def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace
     assert_close(image, 1, atol=tol.IMAGE_ABS)
 
 
-@pytest.mark.slow
-def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
-    """A bright rectangle before an opaque splat: pixels on its edge mix both in linear light."""
-    splat = Gaussians.from_activated(
-        [(0, 0, 1)], [(50, 50, 0.01)], [(1, 0, 0, 0)], [0.999], np.full((1, 1, 3), 0.2)
-    )
-    half = 0.61
-    image = render(scene(splat, card=wall(0, half, **glowing((0.9, 0.9, 0.9)))), spp=1024)
-    color = decode_light(splats(splat)[0])
-    f = camera().K[0, 0]
-    edge = 16 + f * half / 4  # in px
-    column = int(edge)
-    fraction = (image[12, column, 0] - color[12, column, 0]) / (
-        image[12, 16, 0] - color[12, column, 0]
-    )
-    assert image[12, 16, 0] == pytest.approx(0.9, rel=1e-4)
-    assert fraction == pytest.approx(edge - column, abs=0.17)  # half a step of the 3 x 3 rays
-
-
 def test_surfaces__background_is_behind_all():
     gaussians = cloud(0.0)
     background = (0.1, 0.4, 0.8)
@@ -167,23 +148,6 @@ def test_surfaces__channels_include_them():
     assert_close(image[..., 3], 1, atol=tol.IMAGE_ABS)
     assert_close(image[..., 4], alpha * depth + (1 - alpha) * 4, atol=1e-4)
     assert_close(image[..., 5], alpha / (1 + np.exp(-9)), atol=tol.IMAGE_ABS)
-
-
-@pytest.mark.slow
-def test_surfaces__crop_equals_that_of_the_full_image():
-    shapes = {"ball": {"type": "sphere", "radius": 0.7, **glowing()}}
-    full = render(scene(cloud(0.0), **shapes), spp=256)
-    crop = {"crop_offset_x": 8, "crop_offset_y": 6, "crop_width": 13, "crop_height": 9}
-    # The samples differ: noise in the pixels of the outline.
-    assert_close(
-        render(scene(cloud(0.0), film=crop, **shapes), spp=256), full[6:15, 8:21], atol=0.06
-    )
-
-
-def test_surfaces__of_an_environment_alone_are_its_light():
-    gaussians = cloud(0.0)
-    image = render(scene(gaussians, sky={"type": "constant", "radiance": 0.3}))
-    assert_close(image, over(gaussians, 0.3), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__leave_the_whole_scene_as_it_is():
