@@ -5,7 +5,6 @@ import json
 import re
 import resource
 import struct
-import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -127,16 +126,6 @@ def test_png_image__takes_no_memory_for_chunks_that_are_not_there(length, name):
         image.pixels  # noqa: B018 (it decodes)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 100_000, "kB"
     assert_array_equal(PngImage(file + b"more").pixels, FITTING)
-
-
-def test_header__images_are_not_rotated():
-    """OpenCV follows the orientation in a PNG file."""
-    file = png_bytes(FITTING)
-    exif = b"eXIfMM\0*\0\0\0\x08\0\1\1\x12\0\3\0\0\0\1\0\6\0\0\0\0\0\0"
-    chunk = struct.pack(">I", len(exif) - 4) + exif + struct.pack(">I", zlib.crc32(exif))
-    text = base64.b64encode(file[:33] + chunk + file[33:]).decode()
-    (view, _), _, _ = header_fields(with_entry("cameras.0.background", f'"{text}"'))
-    assert view.backdrop.shape == FITTING.shape
 
 
 def test_header_fields__refuse_images_that_take_too_much_together():

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from morgs_mi.codec.container import StreamWriter, TruncatedStreamError
+from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import (
     coded_frames,
 )
@@ -68,26 +68,6 @@ def test_stream_reader__receives_frames_while_they_are_written():
         assert_same(received_state, state)
 
 
-def test_stream_reader__reports_a_lost_connection_after_complete_frames():
-    packets, states = encoded_clip(3)
-    source, sink = tcp()
-    with sink:
-        writer = StreamWriter(sink, CAMERAS, 25)
-        writer.write(packets[0])
-        sink.write(packets[1].encoded[:-1])
-    got = []
-    with (
-        source,
-        pytest.raises(
-            TruncatedStreamError,
-            match=r"packet 2 at byte .*: truncated or still written; 2 packets",
-        ),
-    ):
-        got.extend(coded_frames(StreamReader(source)))
-    assert_same(got[0], states[0])
-    assert len(got) == 1
-
-
 @pytest.mark.slow
 def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path):
     packets, states = encoded_clip(60, degree=0)
@@ -110,22 +90,3 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
     assert result.stdout.strip() == expected
     assert history(coded_frames(StreamReader(tmp_path / "s"))) == expected
     assert_same(StreamReader(tmp_path / "s").seek(59), states[-1])
-
-
-@pytest.mark.parametrize(
-    ("order", "place", "message"),
-    [
-        ([0, 2, 3], 1, "it does not continue the state after frame 0; "),
-        ([1], 0, "it does not continue a state"),
-        ([0, 1, 2, 3, 0], 4, "its frame must be above 3, got 0"),
-    ],
-)
-def test_coded_frames__name_file_packet_and_byte_of_frames_out_of_order(
-    tmp_path, order, place, message
-):
-    packets, states = encoded_clip(4)
-    chosen = [packets[k] for k in order]
-    write(tmp_path / "s", chosen, [states[k] for k in order], every=9)
-    at = StreamReader(tmp_path / "s").index()[place][2]
-    with pytest.raises(ValueError, match=f"s: packet {place + 1} at byte {at}: {message}"):
-        list(coded_frames(StreamReader(tmp_path / "s")))

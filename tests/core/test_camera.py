@@ -147,9 +147,3 @@ def test_look_at__refuses_bad_input(change, message):
     }
     with pytest.raises(ValueError, match=message):
         Camera.look_at(**{**view, **change})
-
-
-@pytest.mark.parametrize(("distance", "near"), [(5.0, 0.01), (0.02, 2e-4)])
-def test_look_at__has_a_near_plane_before_its_target(distance, near):
-    camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
-    assert camera.near == pytest.approx(near)

@@ -177,21 +177,6 @@ def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(
 # ----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
-    masks = [np.ones((48, 64), bool) for _ in images]
-    spoiled = [image.copy() for image in images]
-    for image, mask in zip(spoiled, masks, strict=True):
-        mask[10:30, 20:40] = False
-        image[10:30, 20:40] = 1.0
-    config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12)
-
-    def fitted(changes):
-        return fit(changes, ball(60, 1), config, masks=masks)
-
-    assert values_of(fitted(spoiled).gaussians) == values_of(fitted(images).gaussians)
-
-
 def test_fit_first_frame__fits_views_of_different_sizes(images):
     start = problem(images, ball(80))
     camera = views()[1].resized(40, 30)
@@ -218,14 +203,6 @@ def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_resul
     assert left_out.mean() == pytest.approx(0.25, abs=0.05)
     assert len(np.unique(left_out, axis=0)) == len(drawn)  # others in each step
     assert np.asarray(result.gaussians.opacities).min() > 0.01
-
-
-def test_fit_first_frame__keeps_the_confidence(images):
-    confidence = np.linspace(-2, 2, 80)
-    gaussians = fit(
-        images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG
-    ).gaussians
-    assert_close(gaussians.logit_confidence, np.float32(confidence))
 
 
 # ---- the confidence

@@ -7,11 +7,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from morgs_mi import RenderConfig
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.core.view import View
-from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.far_views import PointCloud
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
-from morgs_mi.fit.view import mean_psnr, rendered, withheld_blocks
+from morgs_mi.fit.view import mean_psnr, withheld_blocks
 from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views
 from tests.scenes.cameras import look_at_cameras
 
@@ -42,15 +41,6 @@ def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fi
     assert result.points is positions
     assert result.extent == scene_extent(views())
     assert [camera.name for camera in result.cameras] == [camera.name for camera in views()]
-
-
-def test_mean_psnr__is_the_mean_over_its_views():
-    images = bytes_of(images_of(opaque_ball()))
-    shown = [rendered(ball(80), camera, RenderConfig()) for camera in views()]
-    expected = np.mean([psnr(a, image / 255) for a, image in zip(shown, images, strict=True)])
-    assert mean_psnr(ball(80), problem(images).views, RenderConfig()) == pytest.approx(
-        expected, abs=1e-4
-    )
 
 
 def test_mean_psnr__does_not_count_masked_pixels():

@@ -60,13 +60,6 @@ def test_gaussian_splat__channels_agree_with_the_reference_under_their_exr_names
     assert fields == ["R", "G", "B", "A", "motion.X", "motion.Y", "confidence.Y", "depth.Y"]
 
 
-def test_gaussian_splat__supports_pixel_formats(raw):
-    rgb = plugin_image(raw)
-    luminance = plugin_image(raw, {"pixel_format": "luminance"}, aovs="confidence")
-    assert luminance.shape == (*rgb.shape[:2], 2)
-    assert_close(luminance[..., 0], rgb @ (0.212671, 0.715160, 0.072169), atol=tol.IMAGE_ABS)
-
-
 def test_gaussian_splat__crop_equals_that_of_the_full_image(raw):
     full = plugin_image(raw, aovs=AOVS)
     crop = {"crop_offset_x": 5, "crop_offset_y": 7, "crop_width": 9, "crop_height": 4}

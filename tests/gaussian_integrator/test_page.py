@@ -6,7 +6,6 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
@@ -58,11 +57,3 @@ def test_mitsuba_page__lists_all_channels():
     assert all(
         f"`SHAPE.{name}`" in TEXT for name in aov_attributes().values() if name in BY_ACTIVATED_NAME
     )
-
-
-@pytest.mark.parametrize("name", ["eps2d", "alpha_min", "stop_transmittance"])
-def test_mitsuba_page__states_the_defaults_of_the_cut_offs(name):
-    (stated,) = re.findall(rf"^\| `{name}` .*\(Default: (\S+)\)", TEXT, re.MULTILINE)
-    default = getattr(gaussian_splat.RenderConfig(), name)
-    numerator, _, denominator = stated.partition("/")
-    assert float(numerator) / float(denominator or 1) == pytest.approx(default)

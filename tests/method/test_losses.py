@@ -10,9 +10,7 @@ import pytest
 from morgs_mi.core.arrays import from_numpy
 from morgs_mi.method.objective import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.ssim import Target
-from morgs_mi.method.ssim_layout import STRIP, Planes
 from morgs_mi.render.region import Region
-from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.reference import ssim_by_windows
@@ -196,17 +194,3 @@ def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
 
     step(40, 48)
     assert not compiled_by(lambda: step(90, 72))
-
-
-@pytest.mark.parametrize("width", [4, 8, 12, 16])
-def test_runs__cover_the_strips_of_a_region_for_every_width_of_a_block(width):
-    rng = np.random.default_rng(0)
-    for shape in ((70, 150), (33, 101), (41, 97)):
-        drawn = rng.random(shape) < 0.01
-        region = Region.of(drawn, RenderConfig(block_width=width))
-        runs, count = Planes(*shape).runs(region, 0)
-        strips = np.pad(region.mask, ((0, 0), (0, -shape[1] % STRIP)))
-        strips = strips.reshape(shape[0], -1, STRIP).any(axis=2)
-        assert 3 * strips.sum() == (runs["end"] - runs["first"]).sum()
-        pixels = strips.repeat(STRIP, axis=1)[:, : shape[1]]
-        assert count == 3 * pixels.sum()

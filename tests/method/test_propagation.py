@@ -33,10 +33,6 @@ def scene():
     return gaussians, moves, rendered_as(target, views)
 
 
-def still(n):
-    return MotionStart(np.zeros((n, 3), np.float32), np.full(n, -2, np.float32))
-
-
 def start(scene, lifted):
     gaussians, _, views = scene
     problem = MotionProblem(gaussians, views, np.random.default_rng(0))

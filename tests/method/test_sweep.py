@@ -78,9 +78,3 @@ def test_total_error__is_the_sum_over_all_pixels(scene):
         for view in views.values()
     )
     assert KeyImages(views).total_error(wall) == pytest.approx(total, rel=1e-5)
-
-
-def test_rendered__is_the_image_of_each_view(scene):
-    wall, views = scene
-    for v, image in KeyImages(views).rendered(wall).items():
-        assert_close(image, np.asarray(render_view(wall, views[v]).color), rtol=1e-6)

@@ -106,28 +106,6 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
         assert_close(tangent, region.crop(expected), atol=atol, name=name)
 
 
-def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
-    raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
-    view = ActiveView(camera, region=Region.of(mask))
-    image = render_view(Gaussians(**raw), view, ("color", "depth"), BACKGROUND)
-    pixels = Region.of(mask).crop(np.ones(mask.shape, bool))
-    assert np.array_equal(
-        np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1))
-    )
-    assert (np.asarray(image.color)[~pixels] == 0).all()
-    assert (np.asarray(image.depth) == 0).all()
-
-
-def test_region__crop_and_uncropped_are_inverse(camera, mask):
-    region = Region.of(mask)
-    image = np.random.default_rng(0).normal(size=(*mask.shape, 3))
-    result = region.uncropped(region.crop(image))[: mask.shape[0], : mask.shape[1]]
-    assert (result[mask] == image[mask]).all()
-    drawn = region.mask
-    assert (result[~drawn] == 0).all()
-    assert drawn.sum() == region.crop(np.ones((region.height, region.width), bool)).sum()
-
-
 def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask):
     """Another region with another number of Gaussians compiles no kernel."""
 

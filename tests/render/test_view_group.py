@@ -80,17 +80,6 @@ def test_view_group__draws_what_each_view_draws(gaussians):
         assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
 
-def test_view_group__crops_images_of_its_views(gaussians):
-    group = ViewGroup(views_of(gaussians)[:3])
-    images = [
-        np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width))
-        for k, v in enumerate(group.views)
-    ]
-    parts = split(group, group.crop(images))
-    for view, image, part in zip(group.views, images, parts, strict=True):
-        assert np.array_equal(part, view.drawn.crop(image))
-
-
 def test_totals__are_the_sums_over_all_views(gaussians):
     group = ViewGroup(views_of(gaussians))
     drawing = group.draw(gaussians)

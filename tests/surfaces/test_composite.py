@@ -41,29 +41,6 @@ def over(gaussians, linear):
 
 
 @pytest.mark.slow
-def test_surfaces__in_front_equal_themselves_alone():
-    expected = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": camera().sensor(),
-            "integrator": {"type": "path", "max_depth": 3},
-            "ball": {
-                "type": "sphere",
-                "center": [0.2, 0, -1],
-                "radius": 0.6,
-                "bsdf": {"type": "diffuse"},
-            },
-            "wall": wall(-0.2),
-            "lamp": LAMP,
-        }
-    )
-    path = {"type": "path", "max_depth": 3}
-    shapes = {f"shape{i}": shape for i, shape in enumerate(expected.shapes())}
-    scene_with_splats = scene(cloud(0.3), path, lamp=LAMP, **shapes)
-    assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
-
-
-@pytest.mark.slow
 def test_surfaces__alone_keep_their_antialiased_outline():
     """Where there are no splats, the image is the nested integrator's, also in pixels that it
     covers in part.
