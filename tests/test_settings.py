@@ -16,8 +16,7 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.platform.config import types_of
 from morgs_mi.stream_loop import StreamLoop
-from tests.scenes.cameras import look_at_cameras
-from tests.scenes.gaussians import random_sheet
+from tests.scenes.ball_and_wall import cameras, points_and_colors, recorded
 
 BASE = StreamConfig(
     fit=FitConfig(
@@ -103,32 +102,16 @@ def other(name):
 
 @pytest.fixture(scope="module")
 def clip():
-    """Five views of a bright textured square in front of a textured wall; it moves, and the light
-    grows slowly. Images have the noise of a grey level.
-    """
+    """The clip of `ball_and_wall` as the light grows slowly, with noise of a grey level."""
     rng = np.random.default_rng(0)
-    origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
-    views = look_at_cameras(origins)
-    wall = random_sheet(rng, 260, 1.5, 0.5)
-    square = random_sheet(rng, 80, 0.35, -0.4)
-    colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
-    frames = []
-    for t in range(4):
-        moved_square = square + np.array((0.06 * t, 0.02 * t, 0))
-        images = np.stack([image(view, wall, moved_square, colors, t) for view in views])
-        noise = rng.normal(0, 1, images.shape)
-        frames.append([*np.clip(images + noise, 0, 255).astype(np.uint8)])
-    return views, np.concatenate([wall, square]), colors, frames
-
-
-def image(view, wall, square, colors, t):
-    """Draw the points as squares, the far ones first, without noise."""
-    drawn = np.full((48, 64, 3), 0.2)
-    for points, part, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
-        for (x, y), color in zip(view.project(points)[0].astype(int), part, strict=True):
-            rows = slice(max(y - radius, 0), max(y + radius, 0))
-            drawn[rows, max(x - radius, 0) : max(x + radius, 0)] = color
-    return drawn * (1 + 0.01 * t) * 255
+    frames = [
+        [
+            np.clip(image * (1 + 0.01 * t) + rng.normal(0, 1, image.shape), 0, 255).astype(np.uint8)
+            for image in images
+        ]
+        for t, images in enumerate(recorded())
+    ]
+    return cameras(), *points_and_colors(), frames
 
 
 def stream(clip, config):

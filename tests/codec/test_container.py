@@ -94,15 +94,6 @@ def test_packet__is_encoded_once_and_does_not_change():
         packet.arrays["a"][0] = 7
 
 
-def test_stream_reader__reads_a_growing_file_up_to_its_last_complete_packet(tmp_path):
-    with StreamWriter(tmp_path / "s", cameras(), 30) as writer:
-        reader = StreamReader(tmp_path / "s")
-        for i, packet in enumerate(PACKETS):
-            assert len(list(reader)) == i
-            writer.write(packet)
-        assert len(list(reader)) == len(PACKETS)
-
-
 def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path):
     path = tmp_path / "s"
     ends = write(path)

@@ -96,7 +96,7 @@ def with_array(packet, name, array):
             lambda key, _: with_head(key, 60, 1, 5, 60),
             r"'optional': 1, .* got \[60, 1, 5, 60\]; read it with the release that wrote it",
         ),
-        (lambda key, _: with_head(key, 60, 1, 1, 5), "its ids do not ascend"),
+        (lambda key, _: with_head(key, 60, 1, 1, 59), "its ids do not ascend"),
         (
             lambda _, residual: with_head(residual, 2**31, 8),
             r"'births': \d+, .* got \[2147483648, 8\]",

@@ -39,17 +39,6 @@ def test_forecast__names_the_cameras_that_would_help(count, degrees, quality, mo
     assert result.sentence.endswith(advice)
 
 
-def test_forecast__measures_two_cameras_side_by_side_at_the_depth_of_the_points():
-    cameras = [c for x in (-0.1, 0.1) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
-    near = forecast(cameras, points)
-    far = forecast(cameras, points + np.array([0, 0, 4]))
-    assert near.spacing == pytest.approx(np.rad2deg(2 * np.arctan(0.1 / 4)), rel=0.1)
-    assert far.spacing == pytest.approx(near.spacing / 2, rel=0.1)
-    assert min(near.overlap, far.overlap) > 0.9
-    assert "will be good: 2 cameras, 3 degrees apart" in near.sentence
-
-
 def test_forecast__sees_that_neighbours_share_little():
     cameras = look_at_cameras(arc(np.deg2rad([-6, -2, 2, 6]), 4), 4)
     spread = [

@@ -5,7 +5,6 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import pytest
 from scipy.sparse import csr_array
 
 from morgs_mi.method.motion_model import (
@@ -15,7 +14,7 @@ from morgs_mi.method.motion_model import (
 )
 from morgs_mi.method.motion_start import MotionStart
 from tests.scenes.ball import opaque_ball, views
-from tests.scenes.shifted_ball import FIT, PLAIN, SHIFT, fit_shifted, motion_error, psnr_of
+from tests.scenes.shifted_ball import FIT, PLAIN, SHIFT, fit_shifted, motion_error
 
 
 @MOTION_MODELS.register("test-shift")
@@ -42,15 +41,6 @@ MODEL = replace(PLAIN, model="test-shift")
 
 def fit(config=FIT, start=None, share=MODEL.model_share):
     return fit_shifted(replace(MODEL, model_share=share), start, config)
-
-
-@pytest.mark.slow
-def test_fit_later_frame__finds_the_motion_that_gaussians_share():
-    free = fit_shifted(PLAIN)
-    shared = fit()
-    assert motion_error(shared) < 0.7 * motion_error(free)
-    assert psnr_of(shared) > psnr_of(free)
-    assert shared.steps == free.steps == FIT.epochs * len(views())
 
 
 def test_fit_later_frame__continues_from_a_start():

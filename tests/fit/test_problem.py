@@ -91,14 +91,10 @@ def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
 
     def extent(spread):
         cameras = look_at_cameras([(x, 0, -12) for x in (-spread, spread)], 40)
-        black_views = [
-            View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras
-        ]
-        config = FitConfig(num_gaussians=50)
+        black_views = [View(camera, np.zeros((48, 64, 3), np.uint8)) for camera in cameras]
         cloud = PointCloud(points, np.full_like(points, 0.5))
-        return FirstFrameProblem.of(
-            black_views, cloud, config, RenderConfig(), np.random.default_rng(0)
-        ).extent
+        rng = np.random.default_rng(0)
+        return FirstFrameProblem.of(black_views, cloud, FitConfig(), RenderConfig(), rng).extent
 
     assert extent(0.1) == pytest.approx(12 / 6, rel=0.1)
     assert extent(5.0) == pytest.approx(1.1 * 5.0)

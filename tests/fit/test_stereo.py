@@ -54,9 +54,3 @@ def test_stereo_points__finds_none_if_one_camera_is_before_the_other(views):
         pose[:3, 3] = shift
         ahead = replace(camera, viewmat=pose @ camera.viewmat)
         assert len(dense([views[0], replace(views[0], camera=ahead)])[0]) == 0
-
-
-def test_stereo_points__finds_none_between_distant_cameras(textured_capture):
-    all_views = next(textured_capture.frames()).views
-    points, colors = dense([all_views[0], all_views[5]])
-    assert points.shape == colors.shape == (0, 3)

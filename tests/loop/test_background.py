@@ -23,6 +23,3 @@ def test_over_border__of_few_far_cameras_is_the_mean_colour(caplog):
     assert message.startswith("no points: the background is the mean colour of the images, (0.")
     given = replace(setup, config=StreamConfig(render=RenderConfig(background=(1, 1, 1))))
     assert over_border(given, images) is given
-    views = [room_view(camera) for camera in rig(12)]
-    setup = prepare(views, no_points, no_points, StreamConfig())
-    assert over_border(setup, [view.image for view in views]) is setup

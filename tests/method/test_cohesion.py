@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
 from tests.scenes.gaussians import isotropic, random_sheet
 
@@ -43,16 +42,6 @@ def test_share_confidence__rejects_evidence_on_a_part_of_a_static_surface():
     """A shadow on the wall: its Gaussians are the patch's."""
     confidence = shared(wall_and_object(0.0), moving(0.7))
     assert (confidence < 0).mean() > 0.98
-
-
-def test_share_confidence__is_not_stopped_by_transparent_neighbours():
-    gaussians = wall_and_object(1.0)
-    rng = np.random.default_rng(2)
-    ghosts = isotropic(random_sheet(rng, 100, 0.3, 1.0), 0.05, 0.01)
-    everything = Gaussians.concatenate([gaussians, ghosts])
-    logit = np.concatenate([moving(0.7), np.full(100, STILL, np.float32)])
-    confidence = shared(everything, logit)
-    assert (confidence[:700][~WALL] > 0).all()
 
 
 def test_share_confidence__solves_its_equation(monkeypatch):

@@ -41,13 +41,6 @@ def test_fit_exposure__is_not_drawn_by_a_third_of_moved_pixels():
     assert_close(fit_exposure(scene(), recorded, weights=(0, 0)), WARM, 2e-3)
 
 
-def test_fit_exposure__explains_a_factor_on_the_light_within_a_grey_level():
-    colors = scene()
-    brighter = encode_light(1.2 * decode_light(colors))
-    exposure = fit_exposure(colors, brighter)
-    assert np.abs(exposure(colors) - brighter).max() < 1 / 255
-
-
 def test_fit_exposure__is_the_prior_without_well_exposed_pixels():
     assert fit_exposure(np.ones((40, 40, 3)), scene(size=(40, 40)), prior=WARM) == WARM
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.arrays import from_numpy
-from morgs_mi.method.objective import flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.method.objective import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
 from morgs_mi.testing import assert_close
@@ -120,13 +120,6 @@ def test_mask_loss__is_the_mean_absolute_difference():
     assert loss == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
-def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
-    offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
-    assert item(offset_loss(mi.TensorXf(offset), 1 / (2.0 * 7))) == pytest.approx(
-        np.abs(offset).sum(1).mean() / 2, rel=1e-5
-    )
-
-
 @pytest.mark.parametrize("width", [64, 77])
 @pytest.mark.parametrize("masked", [False, True])
 def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, masked):
@@ -166,16 +159,6 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
     assert region_loss - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
     again, again_grad = evaluate(changed, region)  # the surroundings are unchanged
     assert (again, np.abs(again_grad - region_grad).max()) == (region_loss, 0)
-
-
-@pytest.mark.parametrize("width", [23, 24])
-def test_target__difference_is_that_of_every_pixel(width):
-    rng = np.random.default_rng(0)
-    image, truth = (np.float32(rng.uniform(size=(19, width, 3))) for _ in range(2))
-    mask = rng.uniform(size=(19, width)) < 0.7
-    target = Target(truth, mask)
-    expected = (truth - image) * mask[..., None]
-    assert np.allclose(target.difference(mi.TensorXf(image)), expected, atol=1e-6)
 
 
 def test_recon_loss__compiles_its_kernels_once_for_all_sizes():

@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import KDTree
 
 from morgs_mi import RenderConfig
-from morgs_mi.method import cohesion
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import STARTS, initial_motion
@@ -49,14 +47,6 @@ def test_initial_motion__runs_the_stages_that_are_on():
     )
     assert refined_error < 0.5 * error < 0.5 * np.linalg.norm(SHIFT)
     assert motion.color_change is not None
-
-
-def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch):
-    """The stages and the cohesion share it; the search has its own, of displaced Gaussians."""
-    built = []
-    monkeypatch.setattr(cohesion, "KDTree", lambda points, **_: built.append(0) or KDTree(points))
-    start(replace(MotionConfig(), search_motion=False))
-    assert len(built) == 1
 
 
 def test_initial_motion__has_no_motion_without_flow():

@@ -58,17 +58,11 @@ def test_rasterize__sums_the_gradients_of_cameras():
         }
         return grads | {f"pose {v}": gradient(pose) for v, pose in enumerate(poses)}
 
-    batch = gradients(
-        lambda trained, posed: dr.sum(
-            rasterize(trained, posed).color * mi.TensorXf(weights), axis=None
-        )
-    )
-    alone = gradients(
-        lambda trained, posed: sum(
-            dr.sum(rasterize(trained, camera).color * mi.TensorXf(weights[v]), axis=None)
-            for v, camera in enumerate(posed)
-        )
-    )
+    def loss(trained, posed, weight):
+        return dr.sum(rasterize(trained, posed).color * mi.TensorXf(weight), axis=None)
+
+    batch = gradients(lambda trained, posed: loss(trained, posed, weights))
+    alone = gradients(lambda trained, posed: sum(map(loss, [trained] * 3, posed, weights)))
     for name, grads in batch.items():
         assert np.abs(grads).max() > 0
         assert_close(grads, alone[name], rtol=1e-5, atol=1e-5)

@@ -116,16 +116,6 @@ def test_rasterize__gradients_of_the_pose_at_the_extremes():
         {"sh_coeffs": np.full((6, 4, 3), 1e18)},
         {"motion": np.full((6, 3), 1e17)},
     ],
-    ids=[
-        "scales",
-        "needles",
-        "opacities",
-        "confidence",
-        "means",
-        "colours below 0",
-        "colours",
-        "motion",
-    ],
 )
 def test_rasterize__raw_extremes_stay_finite(change):
     gaussians = raw_gaussians(**change)

@@ -66,7 +66,6 @@ def test_means2d__absolute_gradient_is_the_sum_over_pixels():
             {"view": ActiveView(CAMERA, region=Region.of(np.ones((H, W), bool)))},
             "`region` must be None with `means2d`",
         ),
-        ({"depth_limit": np.ones((H, W))}, "`depth_limit` must be None with `means2d`"),
     ],
 )
 def test_means2d__refuses_what_it_cannot_do(options, words):
