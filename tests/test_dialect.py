@@ -47,15 +47,3 @@ def test_check_dialect__accepts_other_code(tmp_path):
     )
     (tmp_path / "module.py").write_text("\n".join(lines), encoding="utf-8")
     assert status_and_text(tmp_path, ".") == (0, "")
-
-
-def test_check_dialect__takes_modules_and_refuses_to_check_none(tmp_path):
-    (tmp_path / "module.py").write_text("A = B = 1\n", encoding="utf-8")
-    for places, part in (
-        (["module.py"], "one constant"),
-        ([], "found none"),
-        (["x"], "found none"),
-    ):
-        status, text = status_and_text(tmp_path, *places)
-        assert status == 1
-        assert part in text

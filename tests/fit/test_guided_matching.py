@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from morgs_mi.fit.features import SharedFeatures
 from morgs_mi.fit.guided_matching import match_guided
 from tests.scenes.textured import turned
@@ -17,10 +15,6 @@ def test_match_guided__finds_true_matches_alone(textured_capture, textured_featu
     assert match.views == (0, 4)
     assert len(match.features) > 100
     assert textured_features.reprojection_errors(match, cameras).max() < 1
-    free = next(m for m in textured_features.matches if m.views == (0, 4))
-    is_exact = textured_features.reprojection_errors(free, cameras) < 0.2
-    partners = dict(free.features[is_exact].tolist())
-    assert np.mean([partners[a] == b for a, b in match.features.tolist() if a in partners]) > 0.95
     assert match_guided(textured_features, [cameras[0]] * 6, [(0, 4)]) == []
 
     def with_axes(axes):

@@ -120,19 +120,19 @@ def test_seed_points__are_far_before_parallel_cameras():
 
 
 def test_seed_points__lie_on_valid_pixels_in_their_colours():
-    cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
-    masks = [np.zeros((c.height, c.width), bool) for c in cameras]
-    images = [np.full((c.height, c.width, 3), 255, np.uint8) for c in cameras]
-    for mask, image in zip(masks[:2], images, strict=False):
-        mask[10:20, 30:50] = True
-        image[10:20, 30:50] = 51
-    views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
+    mask = np.zeros((48, 64), bool)
+    mask[10:20, 30:50] = True
+    _, grey_views = few_points()
+    views = [
+        replace(view, image=np.where(valid[..., None], view.image, 255), mask=valid)
+        for view, valid in zip(grey_views, (mask, mask, np.zeros_like(mask)), strict=True)
+    ]
     points, colors = seed_points(views, 101, np.random.default_rng(0))
     assert len(points) == len(colors) == 101
     assert_allclose(colors, 0.2)
     shown = np.zeros(101, bool)
-    for camera, mask in zip(cameras, masks, strict=True):
-        rows_of_points, pixels, _ = seen_points(camera, points)
+    for view in views[:2]:
+        rows_of_points, pixels, _ = seen_points(view.camera, points)
         columns, rows = pixels.astype(int).T
         shown[rows_of_points] |= mask[rows, columns]
     assert shown.all()
@@ -140,16 +140,14 @@ def test_seed_points__lie_on_valid_pixels_in_their_colours():
 
 def red_ball_views(background):
     """Return eight views around a red ball of radius 1 at the origin, over a plain background."""
-    cameras = look_at_cameras(arc(np.arange(8) * np.pi / 4, 5, y=-1))
-    images = [np.full((c.height, c.width, 3), background, np.float32) for c in cameras]
-    for camera, image in zip(cameras, images, strict=True):
+    views = []
+    for camera in look_at_cameras(arc(np.arange(8) * np.pi / 4, 5, y=-1)):
+        image = np.full((camera.height, camera.width, 3), background, np.float32)
         rows, columns = np.indices(image.shape[:2])
-        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2) + 0.5
-        rays = camera.unproject(pixels, np.ones(len(pixels))) - camera.position
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        distance = np.linalg.norm(np.cross(rays, camera.position), axis=1)
-        image[(distance < 1).reshape(rows.shape)] = 0.8, 0.1, 0.1
-    return [View(camera, image) for camera, image in zip(cameras, images, strict=True)]
+        origin, rays = camera.rays(np.stack([columns, rows], axis=-1) + 0.5)
+        image[np.linalg.norm(np.cross(rays, origin), axis=-1) < 1] = 0.8, 0.1, 0.1
+        views.append(View(camera, image))
+    return views
 
 
 def test_seed_points__lie_where_most_views_show_their_colour():

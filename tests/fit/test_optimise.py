@@ -17,7 +17,6 @@ from morgs_mi.fit.optimise import (
     view_order,
 )
 from morgs_mi.testing import assert_close
-from tests.scenes.derivatives import backward
 
 
 def bowl(values, view):
@@ -107,32 +106,6 @@ def test_replace_parameter__keeps_moments():
     assert np.array_equal(ends[0][:, 0], ends[1][:, 0])
     assert ends[1].shape == (2, 3)
     assert 0 < ends[1][0, 1] < ends[1][0, 0]
-
-
-def test_select_rows__keeps_moments_of_survivors_only():
-    """After rows were only added and removed, survivors take the same steps as without it."""
-    rng = np.random.default_rng(2)
-    start, slope = rng.normal(size=(2, 6, 3)).astype(np.float32)
-    rows = np.array([0, 2, 5, 2])
-    is_birth = np.array([False, False, False, True])
-
-    def run(rebuild):
-        optimizer = adam({"x": mi.TensorXf(start)})
-        optimizer.set_learning_rate({"x": 0.1})
-        gradients = slope
-        for step in range(8):
-            if rebuild and step == 4:
-                select_rows(optimizer, rows, is_birth)
-                gradients = slope[rows]
-            backward(dr.square(optimizer["x"]) * mi.TensorXf(gradients))
-            optimizer.step()
-        return np.asarray(values_of(optimizer)["x"])
-
-    whole = run(False)
-    rebuilt = run(True)
-    assert rebuilt.shape == (4, 3)
-    assert np.array_equal(rebuilt[:3], whole[rows[:3]])
-    assert not np.array_equal(rebuilt[3], rebuilt[1])
 
 
 def test_select_rows__adds_edits_to_the_parameters():

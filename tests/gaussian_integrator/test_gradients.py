@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi import RenderConfig, rasterize
-from morgs_mi.surfaces import gaussian_splat
 from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
@@ -178,36 +176,6 @@ def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     dr.forward_to(image)
     slope = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
     assert slope == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
-
-
-def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
-    """With the same settings, in a fixed order, and through a film that changes nothing."""
-    film = {"rfilter": {"type": "box"}}
-    scene = make_mitsuba_scene(to_gaussians(raw), film, srgb_primitives=False)
-    params = mi.traverse(scene)
-    camera = make_sensor_camera()
-    weight = mi.TensorXf(
-        np.float32(np.random.default_rng(8).normal(size=(camera.height, camera.width, 3)))
-    )
-    names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
-
-    def gradients(image):
-        backward(image * weight)
-        grads = [np.array(dr.grad(params[name])) for name in names]
-        for name in names:
-            dr.set_grad(params[name], 0)
-        return grads
-
-    dr.enable_grad([params[name] for name in names])
-    shape = scene.shapes()[0]
-    splats = gaussian_splat._SceneGaussians(
-        **gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"])
-    )
-    camera = gaussian_splat._sensor_camera(scene.sensors()[0], border=0)
-    plugin = gradients(mi.render(scene, params))
-    direct = gradients(rasterize(splats, camera, ("color",), config=RenderConfig()).color)
-    for name, by_plugin, by_rasterize in zip(names, plugin, direct, strict=True):
-        assert_array_equal(by_plugin, by_rasterize, err_msg=name)
 
 
 def counting_renders(monkeypatch):

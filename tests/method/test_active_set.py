@@ -152,24 +152,20 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(previous, curr
     config = FitConfig(sh_degree=0, epochs=12, density=density)
     truth = images_of(current)
     active = found(previous, changes(previous, current))
-    errors = {}
-    for name, some in (("whole", full_active_set(previous, cameras(), RENDER)), ("active", active)):
-        fitted = fit(previous, some, truth, config)
-        errors[name] = np.sqrt(
-            np.mean([(a - b) ** 2 for a, b in zip(images_of(fitted.gaussians), truth, strict=True)])
-        )
-    start = np.sqrt(
-        np.mean([(a - b) ** 2 for a, b in zip(images_of(previous), truth, strict=True)])
+    whole = fit(previous, full_active_set(previous, cameras(), RENDER), truth, config)
+    fitted = fit(previous, active, truth, config)
+    start_error, whole_error, error = (
+        np.sqrt(np.square(np.subtract(images_of(gaussians), truth)).mean())
+        for gaussians in (previous, whole.gaussians, fitted.gaussians)
     )
-    assert errors["whole"] < 0.4 * start
+    assert whole_error < 0.4 * start_error
     # Half a dB; it is better where the full fit disturbs what was right.
-    assert errors["active"] < 1.06 * errors["whole"]
-    assert np.array_equal(
-        fitted.source[fitted.source >= 0], np.unique(fitted.source[fitted.source >= 0])
-    )
+    assert error < 1.06 * whole_error
+    survivors = fitted.source[fitted.source >= 0]
+    assert np.array_equal(survivors, np.unique(survivors))
     assert (fitted.source == -1).any() == grows
     still = np.setdiff1d(np.arange(len(previous)), active.indices)
-    where = np.searchsorted(fitted.source[fitted.source >= 0], still)
+    where = np.searchsorted(survivors, still)
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):

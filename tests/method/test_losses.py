@@ -62,16 +62,6 @@ def test_recon_loss__gradient_agrees_with_central_differences(images, weight):
         assert np.vdot(grad, v) == pytest.approx(slope, rel=tol.LOSS_GRADIENT_REL, abs=1e-6)
 
 
-def test_recon_loss__ignores_masked_pixels(images):
-    image, target = images
-    mask = np.ones(SIZE[:2], bool)
-    mask[3:9, 5:11] = False
-    other = image.copy()
-    other[~mask] = 7.0
-    losses = [item(recon_loss(mi.TensorXf(v), Target(target, mask), 0.2)) for v in (image, other)]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-6)
-
-
 @pytest.mark.parametrize("share", [1, 0.5])
 def test_target__has_the_errors_of_its_valid_pixels_and_of_a_constant_image(images, share):
     image, pixels = images

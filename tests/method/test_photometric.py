@@ -10,37 +10,18 @@ import pytest
 from morgs_mi import SH_C0
 from morgs_mi.method.motion import refine_start
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import render_view
-from tests.scenes.cameras import look_at_cameras
-from tests.scenes.gaussians import isotropic, random_sheet
+from tests.method.clump import STATIC, clump_and_wall
 from tests.scenes.views import rendered_as
 
 SHIFT = np.float32([0.05, -0.03, 0.02])  # two pixels
 MOVING = 80
-STATIC = 400
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """A bright clump that moves by SHIFT in front of a dark static wall, in two views."""
-    rng = np.random.default_rng(0)
-    means = np.concatenate([rng.normal(0, 0.15, (MOVING, 3)), random_sheet(rng, STATIC, 1.2, 0.6)])
-    colors = np.concatenate(
-        [rng.uniform(0.2, 1.5, (MOVING, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))]
-    )
-    gaussians = isotropic(means, 0.05, 0.9, colors)
-    views = dict(
-        enumerate(
-            map(ActiveView, look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 128, 96))
-        )
-    )
-    return gaussians, rendered_as(moved(gaussians), views)
-
-
-def moved(gaussians):
-    displacement = SHIFT * (np.arange(len(gaussians)) < MOVING)[:, None]
-    return replace(gaussians, means=np.asarray(gaussians.means) + displacement)
+    gaussians, _, views = clump_and_wall(MOVING, 0.15, SHIFT, 128, 96)
+    return gaussians, views
 
 
 def with_colors(gaussians, change):

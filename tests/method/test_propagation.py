@@ -2,15 +2,12 @@
 
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 from morgs_mi.method.motion import propagate_motion
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.render.active_view import ActiveView
-from tests.scenes.cameras import look_at_cameras
-from tests.scenes.gaussians import isotropic, random_sheet
+from tests.method.clump import clump_and_wall
 from tests.scenes.views import rendered_as
 
 SHIFT = np.float32([0.25, -0.1, 0.0])
@@ -18,19 +15,7 @@ SHIFT = np.float32([0.25, -0.1, 0.0])
 
 @pytest.fixture(scope="module")
 def scene():
-    """A bright clump of 60 in front of a dark wall; the clump moves by SHIFT."""
-    rng = np.random.default_rng(0)
-    wall = random_sheet(rng, 400, 1.2, 0.6)
-    means = np.concatenate([rng.normal(0, 0.12, (60, 3)), wall])
-    colors = np.concatenate([rng.uniform(0.5, 1.5, (60, 1, 3)), rng.uniform(-1.5, -1, (400, 1, 3))])
-    gaussians = isotropic(means, 0.05, 0.9, colors)
-    moves = np.arange(460) < 60
-    target = replace(
-        gaussians, means=mi.TensorXf(np.asarray(gaussians.means) + SHIFT * moves[:, None])
-    )
-    cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45)
-    views = {view: ActiveView(camera) for view, camera in enumerate(cameras)}
-    return gaussians, moves, rendered_as(target, views)
+    return clump_and_wall(60, 0.12, SHIFT)
 
 
 def start(scene, lifted):

@@ -69,12 +69,3 @@ def test_sums__are_the_sums_of_each_view(scene):
         for name, sums in expected(wall, view, view.target).items():
             mine = result[name][k].reshape(sums.shape)
             assert_close(mine[mask], sums[mask], rtol=1e-4, name=f"{name} of view {k}")
-
-
-def test_total_error__is_the_sum_over_all_pixels(scene):
-    wall, views = scene
-    total = sum(
-        np.abs(view.target.difference(render_view(wall, view).color)).sum() / 3
-        for view in views.values()
-    )
-    assert KeyImages(views).total_error(wall) == pytest.approx(total, rel=1e-5)

@@ -23,45 +23,6 @@ from morgs_mi.render.render_config import RenderConfig
 
 
 @config_class
-class Leaf:
-    """Every type of value that a config may hold."""
-
-    number: float = 1e-5
-    """Length in px."""
-    count: int = 3
-    name: str = "a"
-    """Name of
-    the leaf."""
-    on: bool = False
-    sizes: tuple[int, ...] = (1, 2)
-    pair: tuple[float, float] = (1.5, 0.5)
-    limit: float | None = 0.5
-    """Limit; None: no limit."""
-    mode: Literal["fast", "exact"] | None = None
-
-    def __post_init__(self):
-        if self.count < 0:
-            raise ValueError(f"Leaf(): `count` must not be negative, got {self.count}; take 0.")
-
-
-@config_class
-class Branch:
-    """A config between others, with a setting behind a nested one."""
-
-    leaf: Leaf = field(default_factory=Leaf)
-    """Inner settings."""
-    weight: float = 2.0
-
-
-@config_class
-class Root:
-    """A config two levels deep."""
-
-    branch: Branch = field(default_factory=Branch)
-    seed: int = 0
-
-
-@config_class
 class Config:
     """A field of every kind."""
 
@@ -75,6 +36,8 @@ class Config:
     seed: int = 0
     on: bool = True
     name: str = ""
+    """Name of
+    the config."""
     mode: Literal["off", "auto", "on"] = "off"
     blurs: tuple[Annotated[float, Gt(0)], ...] = (6.0, 3.0)
     size: tuple[int, int] | None = None
@@ -91,14 +54,15 @@ class Config:
             ),
             render=RenderConfig(block_width=4, block_height=None),
         ),
-        Leaf(
+        Config(
             number=3e38,
             name='"quoted" \\ \n\t\x00\x1b\x7f é 漢 🙂',
-            sizes=(),
-            limit=None,
-            mode="exact",
+            blurs=(),
+            opacity=None,
+            mode="auto",
+            size=(2, 3),
         ),
-        Root(Branch(Leaf(pair=(0.25, -0.0), count=2**63, name="none"), weight=-1.0), seed=4),
+        Config(number=-0.0, seed=2**63, name="none", offset={"a": 1.0}),
     ],
 )
 def test_config_toml__is_read_back_as_the_same_config(config, tmp_path):
@@ -123,7 +87,7 @@ def test_config_toml__has_every_setting_with_its_docstring():
         if line and not line.startswith("#"):
             assert lines[index - 1].startswith("# "), line
     assert max(map(len, lines)) <= 120
-    assert "# Name of the leaf.\n" in config_toml(Leaf())
+    assert "# Name of the config.\n" in config_toml(Config())
 
 
 def test_apply_values__replaces_only_what_is_named():
@@ -151,9 +115,9 @@ def test_apply_values__replaces_only_what_is_named():
             "`fit` must be a table, got ({'epochs': 1},).",
         ),
         (
-            Root(),
-            "[branch.leaf]\ncount = -1",
-            "`branch.leaf.count` must not be negative, got -1; take 0.",
+            StreamConfig(),
+            "[fit.density]\nbirths = -1",
+            "`fit.density.births` must be at least 0",
         ),
     ],
 )

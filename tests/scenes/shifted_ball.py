@@ -9,7 +9,7 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.motion_config import MotionConfig
-from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
+from tests.scenes.ball import images_of, opaque_ball, views
 from tests.scenes.views import observed
 
 SHIFT = np.array([0.06, -0.03, 0.02], np.float32)
@@ -36,8 +36,3 @@ def fit_shifted(motion, start=None, config=FIT):
 def motion_error(result):
     """Return the mean error of the displacements, in world units."""
     return float(np.linalg.norm(np.asarray(result.gaussians.motion) - SHIFT, axis=1).mean())
-
-
-def psnr_of(result):
-    """Return the mean PSNR against the shifted ball, in dB."""
-    return mean_psnr(result.gaussians, images_of(shifted_ball()))

@@ -7,7 +7,7 @@ from numpy.testing import assert_array_equal
 
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowConfig, FramePair
 from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS, optical_flow
-from tests.method.moving_disc import moving_disc, observed, texture
+from tests.method.moving_disc import moving_disc, texture
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
@@ -20,17 +20,6 @@ def test_optical_flow__recovers_a_translation_with_its_sign(method):
         error = np.linalg.norm(motion - (dx, dy), axis=-1)[10:-10, 10:-10]
         # `dis-ultrafast` stops at a quarter of the resolution.
         assert np.median(error) < 0.5, (dx, dy)
-
-
-def test_observe_key_views__motion_is_the_shift_on_frame_ts_grid():
-    previous, image, disc = moving_disc(240, 320, shift=(6, -4))
-    observation = observed(image, previous)
-    motion = observation.motion
-    reliable = observation.reliable
-    # 0.25 px: DIS smooths over 8x8 patches.
-    assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
-    assert np.linalg.norm(motion[~disc & reliable], axis=-1).mean() < 0.25
-    assert reliable[disc].mean() > 0.8
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
