@@ -71,6 +71,14 @@ def test_resume__continues_with_the_exposures_of_the_reports(auto_exposed, clip)
 
 
 @pytest.mark.slow
+def test_push__leaves_a_change_of_light_in_the_scene(clip):
+    _, _, reports = run([clip[0], brighter(clip[0], [0.8] * 4)], EXPOSED)
+    # All cameras see it: the stream becomes darker, and no exposure changes.
+    assert reports[1].exposures == reports[0].exposures
+    assert reports[1].num_bytes > 1000
+
+
+@pytest.mark.slow
 def test_push__light_above_white_is_fitted_and_followed():
     """The wall of the scene shines with 1 to 20 times white; images, points and packets have
     encoded colours.

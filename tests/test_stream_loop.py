@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import gc
 import threading
-from itertools import pairwise
+from itertools import count, pairwise
 from unittest.mock import Mock
 
 import drjit as dr
@@ -148,6 +148,22 @@ def test_push__fits_views_at_their_own_times(clip):
             scores.append(psnr(shown(loop.gaussians, plain[view]), truth / 255, mask))
         quality.append(np.mean(scores))
     assert quality[0] > quality[1] + 1.5
+
+
+@pytest.mark.slow
+def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip, monkeypatch):
+    # Every reading of the clock takes a second, so that the least number of steps is due at once.
+    clock = count()
+    monkeypatch.setattr("morgs_mi.fit.first_frame.time", Mock(perf_counter=lambda: next(clock)))
+    ticks = []
+    loop = new_loop(with_fit(first_frame_steps=None, first_frame_seconds=1e-3))
+    _, report = loop.push(clip[0][:4], lambda *tick: ticks.append(tick))
+    assert 50 <= report.steps < 100  # some are skipped to keep the time
+    stage, done, total = ticks[-1]
+    assert (stage, done) == ("First frame", total)
+    assert total >= 1.0
+    draft = report.validation["draft"]["sentence"]
+    assert draft.startswith(f"{report.steps} of 100 planned steps in ")
 
 
 @pytest.mark.slow

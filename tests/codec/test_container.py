@@ -1,5 +1,6 @@
 """The stream file: exact round trips, and detection of every damage."""
 
+import io
 import struct
 from dataclasses import replace
 
@@ -104,11 +105,14 @@ def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path):
         got = []
         if length in ends:
             got.extend(StreamReader(path))
-        else:
-            place = rf"s: packet {intact} at byte \d+: .*; {intact} packet"
+            assert len(got) == max(intact - 1, 0)
+            continue
+        for source in (path, io.BytesIO(whole[:length])):
+            got.clear()
+            place = rf"packet {intact} at byte \d+: .*; {intact} packet"
             with pytest.raises(TruncatedStreamError, match=place):
-                got.extend(StreamReader(path))
-        assert len(got) == max(intact - 1, 0)
+                got.extend(StreamReader(source))
+            assert len(got) == max(intact - 1, 0)
 
 
 def with_table(table, rest=b""):
@@ -196,6 +200,17 @@ def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausib
     reader = StreamReader(tmp_path / "s")
     assert [at for *_, at in reader.index()] == ends[:-1]
     assert len(list(reader.near(3))) == len(PACKETS)
+
+
+def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(tmp_path):
+    path = tmp_path / "s"
+    write(path)
+    reader = StreamReader(path)
+    path.write_bytes(path.read_bytes()[:40])
+    sentence = r"s: packet 0 at byte 12: the header ended at byte \d+, now the file has 40 bytes: "
+    for call in (reader.index, reader.closed, lambda: reader.near(1)):
+        with pytest.raises(TruncatedStreamError, match=sentence):
+            call()
 
 
 def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(tmp_path):

@@ -147,3 +147,9 @@ def test_look_at__refuses_bad_input(change, message):
     }
     with pytest.raises(ValueError, match=message):
         Camera.look_at(**{**view, **change})
+
+
+def test_look_at__has_a_near_plane_before_its_target():
+    for distance, near in ((5.0, 0.01), (0.02, 2e-4)):
+        camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
+        assert camera.near == pytest.approx(near)

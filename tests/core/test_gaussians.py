@@ -62,6 +62,13 @@ def test_gaussians__refuse_shapes_that_disagree(name, value, message):
         Gaussians(**{**cloud(1).numpy(), name: value})
 
 
+def test_gaussians__have_no_unknown_attributes_and_are_at_least_one_to_concatenate():
+    with pytest.raises(ValueError, match="must hold at least one"):
+        Gaussians.concatenate([])
+    with pytest.raises(AttributeError, match="no attribute 'roughness'"):
+        _ = cloud(0).roughness
+
+
 def test_numpy__returns_copies():
     gaussians = cloud(0)
     gaussians.numpy()["means"][:] = 7

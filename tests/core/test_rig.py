@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.core.rig import check_near_planes, with_near_planes
+from morgs_mi.core.rig import check_near_planes, scene_extent, with_near_planes
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import arc, circle, look_at_cameras
 
@@ -42,6 +42,11 @@ def test_with_near_planes__scale_with_the_world(scale, points):
 def test_with_near_planes__without_points_follow_the_focus_of_a_dome():
     cameras = look_at_cameras(circle(np.arange(8) * np.pi / 4, 2.7), up=(0, 0, 1))
     assert_close(nears(cameras), 0.2 * np.hypot(2.7, 0.5), rtol=1e-3)
+
+
+def test_with_near_planes__without_points_stay_within_the_rig_of_a_far_scene():
+    cameras = look_at_cameras([(x, 0, -50.0) for x in (-0.5, 0, 0.5)])
+    assert_close(nears(cameras), 0.2 * scene_extent(cameras), rtol=1e-6)
 
 
 def test_with_near_planes__of_parallel_cameras_follow_the_distance_to_the_next_one():

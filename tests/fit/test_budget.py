@@ -52,6 +52,12 @@ def test_plan_first_frame__has_fewer_gaussians_and_steps_in_less_time():
     assert numbers(planned(1e-3)) == (6_250, 100), "an eighth"
 
 
+def test_plan_first_frame__takes_more_time_at_the_size_of_the_last_steps():
+    """Up to the last round of density control, images are half as large, Gaussians fewer."""
+    rounds = planned(1000, replace(CONFIG, density=DensityConfig(rounds=6)))[1]
+    assert 0.8 * planned(1000)[1] < rounds < planned(1000)[1]
+
+
 def test_plan_first_frame__changes_no_number_that_is_given():
     gaussians, steps = numbers(planned(2, replace(CONFIG, num_gaussians=20_000)))
     assert gaussians == 20_000

@@ -59,7 +59,9 @@ def test_plan_additions__survivors_come_first_and_births_last():
 
 @pytest.mark.parametrize(("limit", "births"), [(3, 0), (6, 0), (7, 1)])
 def test_plan_additions__leaves_all_visible_gaussians_at_the_limit(limit, births):
-    plan = additions(cloud(), [0, 1, 2, 3, 4, 5], births=1 / 3, max_gaussians=limit)
+    """Four static Gaussians count, too."""
+    config = dataclasses.replace(CONFIG, births=0.2, max_gaussians=limit + 4)
+    plan = plan_additions(cloud(), np.arange(6.0), config, np.random.default_rng(1), 4)
     assert ((plan.source < 0).sum(), len(plan.source)) == (births, 6 + births)
     assert plan.parent[6:].tolist() == [5][:births]
 

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -13,6 +15,7 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import FirstFrameProblem
 from tests.scenes.ball import bytes_of, images_of, opaque_ball, problem
 from tests.scenes.cameras import arc, look_at_cameras
+from tests.scenes.derivatives import backward, gradient
 from tests.scenes.gaussians import isotropic
 
 COUNT = 4000
@@ -33,6 +36,18 @@ def test_dropped__has_no_opacity_above_one():
     opacities = np.asarray(dropped(opaque, 0.4, np.random.default_rng(0)).opacities)
     assert np.isfinite(opacities).all()
     assert 0.95 < opacities.max() < 1
+
+
+def test_dropped__passes_gradients_to_the_kept_alone():
+    logits = mi.TensorXf(np.zeros(20, np.float32))
+    dr.enable_grad(logits)
+    few = GAUSSIANS.select(np.arange(20)).with_parameters({"logit_opacities": logits})
+    survivors = dropped(few, 0.5, np.random.default_rng(1))
+    backward(survivors.opacities)
+    mask = np.asarray(survivors.opacities) > 1e-6
+    # d(2 sigmoid(l)) / dl at l = 0; the largest opacity is 0.999, where nothing is passed on.
+    assert not gradient(logits)[~mask].any()
+    assert mask.any()
 
 
 def test_adapted_to_images__sets_a_dropout_for_few_views_that_are_noisy_or_far_apart():

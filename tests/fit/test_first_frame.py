@@ -136,6 +136,12 @@ def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkey
     assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
 
 
+@pytest.mark.slow
+def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
+    result = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
+    assert result.gaussians.sh_degree == 3
+
+
 # ---- growth
 # ----------------------------------------------------------------------------------------------
 
@@ -167,6 +173,16 @@ def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(
     fit(images, ball(60), config)
     fit(images, ball(60), CONFIG)
     assert [width for _, width in drawn] == 10 * [32] + 18 * [64]
+
+
+def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
+    mask = np.indices((48, 64))[0] > 15
+    spoiled = [np.where(mask[..., None], image, 1) for image in images]
+    results = [
+        fit(pictures, ball(80), CONFIG, masks=[mask] * 4).gaussians.numpy()
+        for pictures in (images, spoiled)
+    ]
+    assert all(np.array_equal(value, results[1][name]) for name, value in results[0].items())
 
 
 # ---- images, masks and losses

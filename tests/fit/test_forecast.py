@@ -39,6 +39,15 @@ def test_forecast__names_the_cameras_that_would_help(count, degrees, quality, mo
     assert result.sentence.endswith(advice)
 
 
+def test_forecast__measures_two_cameras_side_by_side_at_the_depth_of_the_points():
+    cameras = [c for x in (-0.1, 0.1) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    for depth in (4, 8):
+        result = forecast(cameras, points + np.array([0, 0, depth - 4]))
+        assert result.spacing == pytest.approx(np.rad2deg(0.2 / depth), rel=0.1)
+        assert result.overlap > 0.9
+
+
 def test_forecast__sees_that_neighbours_share_little():
     cameras = look_at_cameras(arc(np.deg2rad([-6, -2, 2, 6]), 4), 4)
     spread = [

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array
 
+from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.motion_model import (
     MOTION_MODELS,
     MotionModel,
@@ -65,3 +66,10 @@ def test_fit_later_frame__shares_its_epochs_with_the_model():
         > 0
     )
     assert np.array_equal(all_of_it.gaussians.log_scales, opaque_ball().log_scales)
+
+
+def test_fit_later_frame__adds_gaussians_by_the_errors_after_the_model():
+    """The stage of the model has no densification scores: an epoch of the residual comes first."""
+    density = DensityConfig(births=0.3, min_error=0)
+    result = fit(replace(FIT, epochs=4, density=density), share=0.5)
+    assert (result.source == -1).any()

@@ -87,6 +87,15 @@ def test_fit_problem__names_images_that_are_worse_than_constant_ones(psnr, error
     assert bool(sentence) == bool(start)
 
 
+def test_optimise__counts_on_from_its_first_step():
+    made = []
+    factors = []
+    optimizer = adam({"x": mi.TensorXf(np.zeros(3, np.float32))})
+    steps = Steps([0] * 3, 5, lambda step: factors.append(step) or 1.0, made.append)
+    optimise(optimizer, {"x": 0.1}, bowl, steps)
+    assert (factors, made) == ([5, 6, 7], [6, 7, 8])
+
+
 def test_replace_parameter__keeps_moments():
     """New columns start without moments; the others take the same steps as without them."""
     ends = []

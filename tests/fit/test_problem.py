@@ -1,5 +1,7 @@
 """The problem of a first frame, and the views that it consists of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -53,8 +55,14 @@ def test_mean_psnr__does_not_count_masked_pixels():
         problem(pictures, **masks).views
         for pictures, masks in ((images, every), (spoiled, every), (spoiled, {}))
     )
-    masked = [mean_psnr(ball(80), some, RenderConfig()) for some in (views, spoiled_views)]
-    assert masked[0] == masked[1] > mean_psnr(ball(80), unmasked_views, RenderConfig()) + 3
+    nothing = replace(views[0], mask=~mask & mask)
+    masked = [
+        mean_psnr(ball(80), some, RenderConfig())
+        for some in (views, spoiled_views, (*views, nothing))
+    ]
+    assert masked[0] == masked[1] == masked[2]
+    assert np.isnan(mean_psnr(ball(80), [nothing], RenderConfig()))
+    assert masked[0] > mean_psnr(ball(80), unmasked_views, RenderConfig()) + 3
 
 
 @pytest.mark.parametrize(
@@ -84,6 +92,12 @@ def test_withheld_blocks__divide_the_valid_pixels():
         assert_array_equal(a.mask ^ b.mask, allowed)
         assert not (a.mask & b.mask).any()
         assert b.mask.sum() / allowed.sum() == pytest.approx(1 / 8, abs=0.06)
+
+
+def test_withheld_blocks__reduce_each_view_to_the_least_width():
+    views = [large_view(), large_view().reduced(80), large_view()]
+    rest, _ = withheld_blocks(views, 80, np.random.default_rng(0))
+    assert [view.camera.width for view in rest] == [80, 80, 80]
 
 
 def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():

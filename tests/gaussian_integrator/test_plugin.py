@@ -257,6 +257,18 @@ def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, messa
         mi.load_dict({"type": "gaussian_splat", **props})
 
 
+def test_gaussian_splat__refuses_an_integrator_around_it():
+    scene = {"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape()}
+    scene = mi.load_dict(
+        {**scene, "integrator": {"type": "moment", "inner": {"type": "gaussian_splat"}}}
+    )
+    with pytest.raises(RuntimeError) as error:
+        mi.render(scene)
+    assert "expected to be the scene's integrator, got an integrator around it" in str(
+        error.value.__cause__
+    )
+
+
 @pytest.mark.slow
 def test_gaussian_splat__names_variants_that_it_does_not_work_in():
     """With `surfaces` it has RGB colours."""

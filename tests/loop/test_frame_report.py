@@ -1,11 +1,12 @@
 """The report of a frame: the PSNR of its training views, and what the status names."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from morgs_mi.core.view import View
+from morgs_mi.fit.fit_config import LearningRates
 from morgs_mi.fit.view import mean_psnr
 from morgs_mi.loop.first_frame import fit_gaussians
 from morgs_mi.render.render_config import RenderConfig
@@ -36,6 +37,15 @@ def test_push__reports_the_psnr_of_the_training_views():
     assert np.isnan(reports[1].psnr), "nothing changes"
     assert reports[2].psnr > 15, "of the pixels that change"
     assert "mse" not in reports[2].losses
+
+
+def test_push__status_names_a_later_frame_that_diverged():
+    rates = {name: 300 * rate for name, rate in asdict(QUICK.fit.rates).items()}
+    fit = replace(QUICK.fit, rates=LearningRates(**rates))
+    loop = StreamLoop(views(), *POINTS, replace(QUICK, fit=fit))
+    first, report = (loop.push(images(frame))[1] for frame in range(2))
+    assert first.status == "ok"
+    assert f"{report.psnr:.1f} dB, worse than constant images" in report.status
 
 
 def test_push__seeds_points_where_no_camera_sees_the_given_ones(caplog):

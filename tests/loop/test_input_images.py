@@ -39,6 +39,11 @@ def test_copied_images__linear_light_stays_as_it_is(image):
     assert_array_equal(copied(image() if callable(image) else image), LIGHT)
 
 
+def test_copied_images__light_without_a_fraction_is_no_integer_of_16_bits():
+    light = np.full_like(LIGHT, 9e29)  # float32 has no fractions there
+    assert_array_equal(copied(light), light)
+
+
 def test_copied_images__flag_of_a_bitmap_counts():
     assert_array_equal(copied(mi.Bitmap(GREY)), GREY)
     linear = mi.Bitmap(GREY)

@@ -49,6 +49,14 @@ def test_change_mask__covers_a_change_of_light():
     assert changed(noisy_image(rng), noisy_image(rng, level=12)).mean() > 0.99
 
 
+def test_change_mask__covers_an_image_without_static_pixels():
+    rng = np.random.default_rng(5)
+    noise = cv2.resize(
+        rng.integers(0, 255, (15, 20, 3), np.uint8), (W, H), interpolation=cv2.INTER_NEAREST
+    )
+    assert changed(noise, np.roll(noise, 8, axis=1)).mean() > 0.8
+
+
 def test_change_mask__ignores_noise_that_is_larger_in_some_places():
     """As in a penumbra of a path tracer: 20 grey levels in a part of the image, 3 elsewhere."""
     rng = np.random.default_rng(6)

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor
+from morgs_mi.method.flow import observe_key_views
+from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
 from tests.method.moving_disc import moving_disc, observed
 
@@ -30,6 +33,17 @@ def test_motion_mask__finds_a_moving_disc(method, shift):
     # that much.
     assert iou(mask, disc) > (48 / 52) ** 2 - 0.1
     assert mask[disc].mean() > 0.95
+
+
+def test_observe_key_views__masks_follow_their_settings():
+    previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
+    for config in (CONFIG, MaskConfig(floor=20)):
+        pair = FramePair(image, previous)
+        observation = observe_key_views({7: pair}, "dis", "grabcut", masks=config)[7]
+        flow = flow_mask(observation.motion, observation.reliable, config)
+        assert_array_equal(observation.mask, MASK_REFINERS.make("grabcut", config)(image, flow))
+        assert flow.any() == (config is CONFIG)
+    assert observed(image, previous).mask is None
 
 
 def test_flow_threshold__follows_width_and_noise():

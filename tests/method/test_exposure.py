@@ -45,6 +45,10 @@ def test_fit_exposure__is_the_prior_without_well_exposed_pixels():
     assert fit_exposure(np.ones((40, 40, 3)), scene(size=(40, 40)), prior=WARM) == WARM
 
 
+def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
+    assert fit_exposure(scene(), 0.9 - scene(), prior=WARM) == WARM
+
+
 def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_have_no_contrast():
     dull = encode_light(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
     exposure = fit_exposure(dull, encode_light(1.1 * decode_light(dull)))

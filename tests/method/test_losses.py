@@ -11,6 +11,7 @@ from morgs_mi.core.arrays import from_numpy
 from morgs_mi.method.objective import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
+from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
 from tests.reference import ssim_by_windows
@@ -110,9 +111,9 @@ def test_mask_loss__is_the_mean_absolute_difference():
     assert loss == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
-@pytest.mark.parametrize("width", [64, 77])
+@pytest.mark.parametrize(("width", "block"), [(64, None), (77, None), (77, 4), (101, 12), (64, 16)])
 @pytest.mark.parametrize("masked", [False, True])
-def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, masked):
+def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, block, masked):
     """If only a region has changed, its derivative is the full view's, and the value changes by the
     same amount.
     """
@@ -121,7 +122,7 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
     y, x = np.mgrid[:height, :width]
     drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
     drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
-    region = Region.of(drawn)
+    region = Region.of(drawn, RenderConfig(block_width=block))
     truth = np.float32(rng.uniform(size=(height, width, 3)))
     changed = (
         region.crop(truth)

@@ -56,6 +56,14 @@ def test_registry__rejects_bad_and_taken_names(registry, name, message):
         registry.register(name)
 
 
+def test_motion_config__refuses_names_that_are_not_registered():
+    for setting in ("flow_method", "mask_method", "model"):
+        with pytest.raises(
+            ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of .*'x"
+        ):
+            morgs_mi.MotionConfig(**{setting: "x"})
+
+
 @pytest.mark.parametrize(
     ("page", "registry", "line"),
     [("flow.md", FLOW_SOURCES, "`{}`"), ("masks.md", MASK_REFINERS, "- `{}`: ")],

@@ -162,6 +162,13 @@ def test_objective_config__refuses_terms(registry, terms, message):
         ObjectiveConfig(terms=terms)
 
 
+def test_objective_config__refuses_terms_where_none_is_registered(registry):
+    with pytest.raises(
+        ValueError, match="`terms` must be one of the registered names, of which there are none"
+    ):
+        ObjectiveConfig(terms=("speed:1",))
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

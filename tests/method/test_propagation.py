@@ -61,8 +61,10 @@ def test_propagate_motion__spreads_no_wrong_motion(scene):
     assert not displacement[~wrong].any()
 
 
-def test_propagate_motion__does_nothing_where_no_view_shows_what_may_move(scene):
+def test_propagate_motion__does_nothing_where_no_view_or_neighbour_shows_what_may_move(scene):
     gaussians, moves, views = scene
     outside = replace(gaussians, means=np.asarray(gaussians.means) - np.float32([0, 0, 50]))
     lifted = lift_of(moves)
     assert start((outside, moves, views), lifted) is lifted
+    alone = MotionStart(SHIFT[None], np.float32([2]))
+    assert start((gaussians.select([0]), moves, views), alone) is alone, "it has no neighbours"

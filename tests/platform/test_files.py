@@ -81,6 +81,13 @@ def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path, case):
     assert tree(tmp_path) == old_tree
 
 
+def test_atomic_path__replaces_no_device_and_no_pipe(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileExistsError, match=r"test\(\): .*/pipe is a device or a pipe"):
+        atomic_path(tmp_path / "pipe", "test()").__enter__()
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_atomic_path__restores_the_old_folder_after_a_failed_swap(tmp_path, monkeypatch):
     write(tmp_path / "x", "folder", "old")
     old_tree = tree(tmp_path)
@@ -106,6 +113,13 @@ def test_atomic_folder__removes_partial_output_of_a_killed_process_of_its_number
     with atomic_folder(tmp_path / "x", "test()") as partial:
         (partial / "b").touch()
     assert tree(tmp_path) == others | {"x": None, "x/b": b""}
+
+
+def test_write_json__follows_a_link(tmp_path):
+    (tmp_path / "link.json").symlink_to(tmp_path / "x.json")
+    write_json(tmp_path / "link.json", {})
+    assert (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "x.json").read_text() == "{}\n"
 
 
 def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(tmp_path):
@@ -158,6 +172,12 @@ def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path):
     assert run_script(script, str(tmp_path)).returncode == -9
     assert len(tree(tmp_path)) == 1
     with locked_folder(tmp_path, "test()"):
+        pass
+    assert not tree(tmp_path)
+
+
+def test_locked_folder__leaves_no_empty_folder(tmp_path):
+    with locked_folder(tmp_path / "new" / "out", "test()"):
         pass
     assert not tree(tmp_path)
 

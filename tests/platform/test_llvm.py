@@ -42,6 +42,12 @@ def test_llvm_major__reads_the_file_name(tmp_path, name, major):
     assert llvm.llvm_major(tmp_path / name) == major
 
 
+def test_llvm_major__follows_links(libraries, tmp_path):
+    libraries("libLLVM.so.20.1")
+    (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM.so.20.1")
+    assert llvm.llvm_major(tmp_path / "libLLVM.so") == 20
+
+
 def test_choose_llvm__takes_the_users_choice_if_it_is_usable_or_else_the_newest(
     libraries, monkeypatch
 ):

@@ -80,6 +80,14 @@ def test_view_group__draws_what_each_view_draws(gaussians):
         assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
 
+def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):
+    group = ViewGroup([ActiveView(make_wide_camera())])
+    drawing = group.draw(replace(gaussians, means=gaussians.means - 1e3))
+    ones = from_numpy(mi.Float, np.ones(group.region.shape(1)))
+    for values in (drawing.color, drawing.sums(ones, 1), drawing.totals(ones, 1)):
+        assert not np.asarray(values).any()
+
+
 def test_totals__are_the_sums_over_all_views(gaussians):
     group = ViewGroup(views_of(gaussians))
     drawing = group.draw(gaussians)

@@ -7,7 +7,7 @@ from morgs_mi import ellipsoids
 from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.gaussians import to_gaussians
 
-AOVS = "motion,confidence,depth"
+AOVS = "motion, confidence,depth"
 
 
 def make_mitsuba_scene(gaussians, film=None, sensor=None, **props):

@@ -127,6 +127,23 @@ def test_surfaces__channels_include_them():
     assert_close(image[..., 5], alpha / (1 + np.exp(-9)), atol=tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
+def test_surfaces__crop_equals_that_of_the_full_image():
+    shapes = {"ball": {"type": "sphere", "radius": 0.7, **glowing()}}
+    full = render(scene(cloud(0.0), **shapes), spp=256)
+    crop = {"crop_offset_x": 8, "crop_offset_y": 6, "crop_width": 13, "crop_height": 9}
+    # The samples differ: noise in the pixels of the outline.
+    assert_close(
+        render(scene(cloud(0.0), film=crop, **shapes), spp=256), full[6:15, 8:21], atol=0.06
+    )
+
+
+def test_surfaces__of_an_environment_alone_are_its_light():
+    gaussians = cloud(0.0)
+    image = render(scene(gaussians, sky={"type": "constant", "radiance": 0.3}))
+    assert_close(image, over(gaussians, 0.3), atol=tol.IMAGE_ABS)
+
+
 def test_surfaces__leave_the_whole_scene_as_it_is():
     """Its parameters keep their names, and its environment its extent."""
     whole = scene(cloud(), ball={"type": "sphere"}, sky={"type": "constant"}, wall=wall(90))

@@ -145,3 +145,13 @@ def test_splat_rays__refuse_what_are_no_gaussians(make):
         ValueError, match=r"SplatRays\(\): `gaussians` must be at least one Gaussian, got a"
     ):
         SplatRays(make())
+
+
+def test_splat_rays__refuse_numbers_that_are_not_finite():
+    gaussians = cloud(5)
+    means = gaussians.numpy()["means"]
+    means[3, 1] = np.nan
+    with pytest.raises(
+        ValueError, match=r"`means` must be finite, got nan at \[3, 1\] \(1 such values\)"
+    ):
+        SplatRays(Gaussians(**{**gaussians.numpy(), "means": means}))

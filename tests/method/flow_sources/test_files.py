@@ -136,3 +136,8 @@ def test_flow_source__rejects_missing_and_broken_files_and_other_sizes(
         write_flow(folder / name, random_flow())
     with pytest.raises(exception, match=message):
         FLOW_SOURCES.make(f"files:{folder}")(pair)
+
+
+def test_flow_source__rejects_a_missing_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
+        FLOW_SOURCES.make(f"files:{tmp_path / 'flow'}")
