@@ -84,21 +84,20 @@ def test_push__light_above_white_is_fitted_and_followed():
     encoded colours.
     """
     shining = []
-    for frame in range(2):
-        gaussians, moves = scene(frame)
-        sh_coeffs = gaussians.numpy()["sh_coeffs"].copy()
-        sh_coeffs[~moves] += 1.5 / SH_C0
+    for gaussians, moves in map(scene, range(2)):
+        light = np.where(moves, 0, 1.5 / SH_C0)[:, None, None]
+        sh_coeffs = gaussians.numpy()["sh_coeffs"] + light
         shining.append(dataclasses.replace(gaussians, sh_coeffs=sh_coeffs))
     images = [
         [decode_light(np.asarray(rasterize(state, camera).color)) for camera in cameras()]
         for state in shining
     ]
     assert max(image.max() for image in images[0]) > 10
-    start = shining[0].numpy()
-    colors = np.maximum(start["sh_coeffs"][:, 0] * SH_C0 + 0.5, 0)
-    loop = StreamLoop(cameras()[:4], start["means"], colors, SHORT)
-    reports = [loop.push([*map(mi.TensorXf, each[:4])])[1] for each in images]
-    assert [report.status for report in reports] == ["ok", "ok"]
+    means = shining[0].means
+    colors = np.maximum(np.asarray(shining[0].sh_coeffs)[:, 0] * SH_C0 + 0.5, 0)
+    loop = StreamLoop(cameras()[:4], means, colors, SHORT)
+    statuses = [loop.push([*map(mi.TensorXf, each[:4])])[1].status for each in images]
+    assert statuses == ["ok", "ok"]
     assert loop.state.history.display_exposure < -1
     rendered = np.asarray(rasterize(loop.gaussians, cameras()[4]).color)
     truth = encode_light(images[1][4])

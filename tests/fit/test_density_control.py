@@ -39,6 +39,7 @@ def test_density_control__adds_where_a_view_has_its_error():
     image[:, 32:] = 1  # behind the third splat
     control = DensityControl([CAMERA])
     control.observe(optimizer, CAMERA, image)
+    control.observe(optimizer, CAMERA, recorded(splats()))  # which has no error
     assert control.scores.argmax() == 2
     plan = control.step(optimizer, births=1)
     assert (plan.parent.tolist(), plan.source.tolist()) == ([0, 1, 2, 2], [0, 1, 2, -1])

@@ -92,6 +92,18 @@ def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradient
     assert derivative == pytest.approx(slope, rel=tol.GRADIENT_REL)
 
 
+def slope(raw, **changes):
+    """Return the derivative of the sum of the squared image along changes of K and viewmat."""
+    camera = make_sensor_camera()
+    view = {name: np.float32(getattr(camera, name)).astype(float) for name in ("K", "viewmat")}
+
+    def loss(view):
+        image = reference.rasterize(raw, width=camera.width, height=camera.height, **view)
+        return np.sum(to_linear(image["color"]) ** 2)
+
+    return reference.directional(loss, view, changes)
+
+
 def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
     """The camera moves to its left by t: to_world = M T(t); viewmat moves points to the right."""
     scene = make_mitsuba_scene(to_gaussians(raw))
@@ -105,13 +117,7 @@ def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
     backward(dr.square(mi.render(scene, params)))
     right = np.zeros((4, 4))
     right[0, 3] = 1
-    viewmat = np.float32(make_sensor_camera().viewmat).astype(np.float64)
-    expected = reference.directional(
-        lambda v: np.sum(expected_image(raw, v["viewmat"])[..., :3] ** 2),
-        {"viewmat": viewmat},
-        {"viewmat": right},
-    )
-    assert dr.grad(t)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+    assert dr.grad(t)[0] == pytest.approx(slope(raw, viewmat=right), rel=10 * tol.GRADIENT_REL)
 
 
 @pytest.mark.slow
@@ -157,14 +163,7 @@ INTRINSICS = {
 def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     camera = make_sensor_camera()
     scene = make_mitsuba_scene(to_gaussians(raw))
-    viewmat, K = (np.float32(matrix).astype(np.float64) for matrix in (camera.viewmat, camera.K))
-
-    def loss(values):
-        image = reference.rasterize(raw, values["K"], viewmat, camera.width, camera.height)["color"]
-        return np.sum(to_linear(image) ** 2)
-
-    change = INTRINSICS[name](K, camera.width, camera.height)
-    expected = reference.directional(loss, {"K": K}, {"K": change})
+    expected = slope(raw, K=INTRINSICS[name](camera.K, camera.width, camera.height))
     params = mi.traverse(scene)
     parameter = params[f"sensor.{name}"]
     dr.enable_grad(parameter)
@@ -174,8 +173,8 @@ def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     dr.set_grad(parameter, 1)
     image = mi.render(scene, params)
     dr.forward_to(image)
-    slope = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
-    assert slope == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+    forward = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
+    assert forward == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
 
 
 def counting_renders(monkeypatch):

@@ -58,9 +58,7 @@ def test_registry__rejects_bad_and_taken_names(registry, name, message):
 
 def test_motion_config__refuses_names_that_are_not_registered():
     for setting in ("flow_method", "mask_method", "model"):
-        with pytest.raises(
-            ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of .*'x"
-        ):
+        with pytest.raises(ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of"):
             morgs_mi.MotionConfig(**{setting: "x"})
 
 
