@@ -13,6 +13,7 @@ from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.platform.config import types_of
 from morgs_mi.stream_loop import StreamLoop
@@ -32,10 +33,18 @@ BASE = StreamConfig(
     motion=MotionConfig(key_views=2, mask_interval=2),
     codec=CodecConfig(),
 )
+
+
+@MASK_REFINERS.register("test-empty")
+def no_mask(argument, config):
+    """Return the refiner that finds no object."""
+    return lambda image, mask: np.zeros_like(mask)
+
+
 # Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
 VALUES = {
     "motion.flow_method": "dis-ultrafast",
-    "motion.mask_method": "none",
+    "motion.mask_method": "test-empty",
     "fit.dropout": 0.3,
     "fit.density.max_gaussians": 150,
     "fit.density.split_scale": 1.0,

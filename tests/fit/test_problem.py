@@ -108,7 +108,8 @@ def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
         black_views = [View(camera, np.zeros((48, 64, 3), np.uint8)) for camera in cameras]
         cloud = PointCloud(points, np.full_like(points, 0.5))
         rng = np.random.default_rng(0)
-        return FirstFrameProblem.of(black_views, cloud, FitConfig(), RenderConfig(), rng).extent
+        config = FitConfig(num_gaussians=50)
+        return FirstFrameProblem.of(black_views, cloud, config, RenderConfig(), rng).extent
 
     assert extent(0.1) == pytest.approx(12 / 6, rel=0.1)
     assert extent(5.0) == pytest.approx(1.1 * 5.0)
