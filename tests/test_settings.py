@@ -13,7 +13,6 @@ from annotated_types import Ge, Gt, Le, Lt, MultipleOf
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.platform.config import types_of
 from morgs_mi.stream_loop import StreamLoop
@@ -35,16 +34,9 @@ BASE = StreamConfig(
 )
 
 
-@MASK_REFINERS.register("test-empty")
-def no_mask(argument, config):
-    """Return the refiner that finds no object."""
-    return lambda image, mask: np.zeros_like(mask)
-
-
 # Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
 VALUES = {
     "motion.flow_method": "dis-ultrafast",
-    "motion.mask_method": "test-empty",
     "fit.dropout": 0.3,
     "fit.density.max_gaussians": 150,
     "fit.density.split_scale": 1.0,
@@ -67,6 +59,7 @@ ELSEWHERE = {
     "fit.refine_cameras": "the recorder refines cameras: tests/extras/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_dropout.py",
+    "motion.mask_method": "flow finds the same masks here: tests/loop/test_observation.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
