@@ -169,20 +169,21 @@ def residual(state, payload):
 
 def numbers(state):
     """Return the attributes of a state, by the names of the package."""
-    e = state["exponents"]
-    group_of_column = [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
-    group_of_column += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
-    real = np.zeros(state["values"].shape)
-    for column, k in enumerate(group_of_column):
-        real[:, column] = [
-            int(q) * F[int(x) % 4] * 2.0 ** (int(x) // 4)
-            for q, x in zip(state["values"][:, column], e[:, k], strict=True)
+    e = state["exponents"].astype(int)
+    steps = np.array(F)[e % 4] * 2.0 ** (e // 4)
+    # Number of columns that have each of the exponents.
+    widths = [3, 1, 1, 1, 3, 1, 3, 3 * ((state["degree"] + 1) ** 2 - 1), state["confidence"]]
+    real = state["values"] * np.repeat(steps, widths[: e.shape[1]], axis=1)
+    u, v, w = real[:, 6:9].T
+    lengths = np.sqrt(((1 + u * u) + v * v) + w * w)
+    quats = np.array(
+        [
+            np.insert(others / length, largest, 1 / length)
+            for others, length, largest in zip(
+                real[:, 6:9], lengths, state["largest_components"], strict=True
+            )
         ]
-    quats = np.zeros((len(real), 4))
-    for i, largest in enumerate(state["largest_components"]):
-        u, v, w = (float(x) for x in real[i, 6:9])
-        length = math.sqrt(((1 + u * u) + v * v) + w * w)
-        quats[i] = np.insert([u / length, v / length, w / length], int(largest), 1 / length)
+    )
     end = 10 + 3 * (state["degree"] + 1) ** 2
     values = {
         "means": real[:, :3],
