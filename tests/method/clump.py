@@ -23,9 +23,10 @@ def clump_and_wall(count, radius, shift, width=64, height=48):
         height: of the images, px.
     """
     rng = np.random.default_rng(0)
-    means = np.concatenate([rng.normal(0, radius, (count, 3)), random_sheet(rng, STATIC, 1.2, 0.6)])
+    wall = random_sheet(rng, STATIC, 1.2, 0.6)
+    means = np.concatenate([rng.normal(0, radius, (count, 3)), wall])
     colors = np.concatenate(
-        [rng.uniform(0.2, 1.5, (count, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))]
+        [rng.uniform(0.5, 1.5, (count, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))]
     )
     gaussians = isotropic(means, 0.05, 0.9, colors)
     moves = np.arange(count + STATIC) < count

@@ -37,7 +37,7 @@ def test_motion_mask__finds_a_moving_disc(method, shift):
 
 def test_observe_key_views__masks_follow_their_settings():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
-    for config in (CONFIG, MaskConfig(floor=20)):
+    for config in (CONFIG, MaskConfig(floor=50)):
         pair = FramePair(image, previous)
         observation = observe_key_views({7: pair}, "dis", "grabcut", masks=config)[7]
         flow = flow_mask(observation.motion, observation.reliable, config)

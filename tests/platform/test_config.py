@@ -62,7 +62,7 @@ class Config:
             mode="auto",
             size=(2, 3),
         ),
-        Config(number=-0.0, seed=2**63, name="none", offset={"a": 1.0}),
+        Config(number=-0.0, seed=2**63, name="none"),
     ],
 )
 def test_config_toml__is_read_back_as_the_same_config(config, tmp_path):
