@@ -68,11 +68,12 @@ def test_change_mask__ignores_noise_that_is_larger_in_some_places():
     assert changed(image, next_image).mean() < 0.005
 
 
-def test_change_mask__finds_a_change_of_colour_alone():
+@pytest.mark.parametrize("change", [(12, -12, 0), (7, 7, -14)])
+def test_change_mask__finds_a_change_of_colour_alone(change):
     rng = np.random.default_rng(7)
     image = noisy_image(rng)
     next_image = noisy_image(rng)
-    next_image[40:60, 50:80] = np.clip(next_image[40:60, 50:80] + np.array([12, -12, 0]), 0, 255)
+    next_image[40:60, 50:80] = np.clip(next_image[40:60, 50:80] + np.array(change), 0, 255)
     mask = changed(image, next_image)
     assert mask[42:58, 52:78].all()
     assert not mask[:34].any()

@@ -59,6 +59,14 @@ def test_share_confidence__solves_its_equation(monkeypatch):
     assert_allclose(many[i], expected, atol=1e-4)
 
 
+def test_share_confidence__counts_all_but_the_chosen_as_still():
+    gaussians = wall_and_object(0.0)
+    indices = np.flatnonzero(~WALL)
+    confidence = shared(gaussians, np.full(100, 2.0, np.float32), indices=indices)
+    assert confidence.shape == (100,)
+    assert (confidence < 0).all()
+
+
 def test_share_confidence__returns_the_logits_without_neighbours_or_weight(monkeypatch):
     one = isotropic(np.zeros((1, 3)), 0.1, 0.9)
     logit = np.array([1.5], np.float32)

@@ -86,6 +86,18 @@ def test_refine_start__follows_a_change_of_light(scene):
     assert max(differences[0]) < 0.5 * min(differences[1])
 
 
+def test_refine_start__trusts_few_pixels_less(scene):
+    gaussians, views = scene
+
+    def followed(sizes):
+        smaller = replace(gaussians, log_scales=np.asarray(gaussians.log_scales) + np.log(sizes))
+        return np.median(
+            color_change(smaller, rendered_as(with_colors(smaller, 0.1 / SH_C0), views))
+        )
+
+    assert followed(0.2) < 0.3 * followed(1.0)
+
+
 def test_refine_start__takes_colours_where_the_step_leads(scene):
     gaussians, views = scene
     displaced = replace(gaussians, means=np.asarray(gaussians.means) + start(0.6).displacement)

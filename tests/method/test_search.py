@@ -11,6 +11,7 @@ from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.search import (
+    _matching_cost,
     _reduction,
     search_motion,
 )
@@ -109,6 +110,19 @@ def test_initial_motion__searches_where_flow_sees_nothing(scene):
         seen = rendered_as(moved(gaussians), views, flows)
         initial = initial_motion(gaussians, active, seen, config, rng)
         assert initial.displacement[MOVES].any() == searches
+
+
+def test_matching_cost__is_the_weighted_squared_difference():
+    rng = np.random.default_rng(0)
+    image, next_image = rng.random((2, 48, 64, 3)).astype(np.float32)
+    weight = np.zeros((48, 64), np.float32)
+    weight[20:26, 30:35] = rng.random((6, 5))
+    cost = _matching_cost(next_image, image, weight)
+    middle = len(cost) // 2
+    for x, y in ((0, 0), (4, -3), (-11, 9)):
+        squares = np.square(np.roll(next_image, (-y, -x), (0, 1)) - image)
+        expected = np.sum(weight[..., None] * squares)
+        assert cost[middle + y, middle + x] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(
