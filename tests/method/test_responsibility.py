@@ -72,6 +72,16 @@ def test_responsibility__is_small_for_a_background_that_other_views_see(gaussian
     assert np.mean(responsibility_for(gaussians, ball_moves())[:WALL] > 0.3) < 0.05
 
 
+def test_responsibility__is_zero_for_hidden_gaussians(gaussians, monkeypatch):
+    everything = {view: np.full((SIDE, SIDE), True) for view in CAMERAS}
+    some = responsibility_for(gaussians, everything) > 0
+    monkeypatch.setattr("morgs_mi.method.active_set.MIN_WEIGHT", 20.0)
+    fewer = responsibility_for(gaussians, everything) > 0
+    assert fewer.sum() < some.sum()
+    _, weight = exact_ratio(gaussians, everything)
+    assert not fewer[weight < 10].any()
+
+
 def test_overlap__counts_hidden_gaussians_and_only_views_in_which_they_are(gaussians):
     changes = {view: np.full((SIDE, SIDE), view == 0) for view in CAMERAS}
     views = changed_views(gaussians, changes)
