@@ -1,18 +1,30 @@
 """Gaussians: parameters of the attribute table, and the parts of the spherical harmonics."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from morgs_mi.core.attributes import ATTRIBUTES
-from morgs_mi.core.gaussians import Gaussians, read_columns
-from tests.scenes.derivatives import gradient
+from morgs_mi.core.gaussians import Gaussians, join_sh, read_columns, split_sh
+from tests.scenes.derivatives import backward, gradient
 from tests.scenes.gaussians import make_scene, to_gaussians
 
 
 def cloud(degree):
     return to_gaussians(make_scene(degree, n=5))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_join_sh__inverts_split_sh_with_gradient(degree):
+    sh = cloud(degree).sh_coeffs
+    dr.enable_grad(sh)
+    joined = join_sh(*split_sh(sh))
+    assert np.array_equal(np.asarray(joined), np.asarray(sh))
+    backward(dr.square(joined))
+    assert gradient(sh) == pytest.approx(2 * np.asarray(sh), rel=1e-6)
 
 
 @pytest.mark.parametrize("size", [3, 4])
@@ -54,7 +66,9 @@ def test_parameters__are_those_of_the_table_and_with_parameters_inverts_them(deg
     [
         ("quats", np.zeros((4, 4)), r"`quats` must be \[5, 4\], got \[4, 4\]"),
         ("sh_coeffs", np.zeros((5, 2, 3)), r"must be .* or \[5, 16, 3\], got \[5, 2, 3\]"),
+        ("means", 0.0, r"`means` must be \[\d, 3\]"),
         ("means", [[1, 2], [3]], "`means` must be an array of real numbers"),
+        ("logit_opacities", mi.Float(np.zeros(5)), "must be a NumPy array or a drjit"),
     ],
 )
 def test_gaussians__refuse_shapes_that_disagree(name, value, message):
@@ -67,6 +81,30 @@ def test_gaussians__have_no_unknown_attributes_and_are_at_least_one_to_concatena
         Gaussians.concatenate([])
     with pytest.raises(AttributeError, match="no attribute 'roughness'"):
         _ = cloud(0).roughness
+
+
+def test_gaussians__are_not_changed_by_later_writes_to_their_arrays():
+    """One buffer per attribute is refilled for each of five frames, so large that kernels run while
+    it is written.
+    """
+    N = 200_000
+    shapes = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "logit_opacities": (),
+        "sh_coeffs": (1, 3),
+    }
+    buffers = {name: np.zeros((N, *shape), np.float32) for name, shape in shapes.items()}
+    frames = []
+    for frame in range(5):
+        for buffer in buffers.values():
+            buffer[:] = frame
+        frames.append(Gaussians(**buffers))
+    for name in shapes:
+        assert [np.unique(np.asarray(getattr(g, name))).tolist() for g in frames] == [
+            [k] for k in range(5)
+        ], name
 
 
 def test_numpy__returns_copies():
@@ -82,3 +120,10 @@ def test_from_activated__refuses_values_that_are_not_activated(name, value):
     values[name][1] = value
     with pytest.raises(ValueError, match=rf"`{name}` must be .*, got {value}.* at \[1"):
         Gaussians.from_activated(**values)
+
+
+def test_repr__has_number_degree_and_size():
+    gaussians = replace(cloud(2), means=[(0, 0, 0), (2, 1, 0), *3 * [(1, 0.5, -0.25)]])
+    text = "Gaussians(N=5, SH degree 2, box of 2 x 1 x 0.25, motion, logit_confidence)"
+    assert repr(gaussians) == text
+    assert repr(gaussians.select(np.zeros(5, bool))).startswith("Gaussians(N=0, SH degree 2, box")

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from morgs_mi.fit.far_views import PointCloud, are_around, far_points
+from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import (
     NO_POINTS,
+    FirstFrameProblem,
     initial_points,
+    mean_color,
     seed_points,
 )
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.room import CENTRE, FLOOR, RADIUS, rig, room_view
 
@@ -81,3 +87,22 @@ def test_initial_points__of_few_far_cameras_are_far_points():
     points, _ = initial_points(views, few, 500, np.random.default_rng(0))
     assert (np.abs(points) < 1e-9).all(axis=1).sum() == 100, "the given ones, and others"
     assert len(np.unique(points, axis=0)) > 300
+    given = np.random.default_rng(0).uniform(-1, 1, (1500, 3))
+    points, _ = initial_points(views, PointCloud(given, given * 0), 500, np.random.default_rng(0))
+    assert {*map(tuple, points)} <= {*map(tuple, given)}
+
+
+def test_fit_first_frame__of_far_views_is_better_than_the_nearest_photo():
+    """Of a fifth view, 36 degrees from the nearest of four."""
+    *views, test = [room_view(camera) for camera in rig(5)]
+    render = RenderConfig(background=mean_color(views))
+    config = FitConfig(num_gaussians=1000, first_frame_steps=150)
+    rng = np.random.default_rng(0)
+    problem = FirstFrameProblem.of(views, NO_POINTS, config, render, rng)
+    gaussians = fit_first_frame(problem, config, rng).gaussians
+    image = np.asarray(rasterize(gaussians, test.camera, ("color",), config=render).color)
+
+    def error(shown):
+        return np.square(shown - test.image / 255).mean()
+
+    assert error(image) < 0.5 * min(error(view.image / 255) for view in views)

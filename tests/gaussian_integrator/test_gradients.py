@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from morgs_mi import RenderConfig, rasterize
+from morgs_mi.surfaces import gaussian_splat
 from morgs_mi.testing import assert_close
 from tests import reference
 from tests import tolerances as tol
@@ -92,18 +94,6 @@ def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradient
     assert derivative == pytest.approx(slope, rel=tol.GRADIENT_REL)
 
 
-def slope(raw, **changes):
-    """Return the derivative of the sum of the squared image along changes of K and viewmat."""
-    camera = make_sensor_camera()
-    view = {name: np.float32(getattr(camera, name)).astype(float) for name in ("K", "viewmat")}
-
-    def loss(view):
-        image = reference.rasterize(raw, width=camera.width, height=camera.height, **view)
-        return np.sum(to_linear(image["color"]) ** 2)
-
-    return reference.directional(loss, view, changes)
-
-
 def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
     """The camera moves to its left by t: to_world = M T(t); viewmat moves points to the right."""
     scene = make_mitsuba_scene(to_gaussians(raw))
@@ -117,7 +107,13 @@ def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
     backward(dr.square(mi.render(scene, params)))
     right = np.zeros((4, 4))
     right[0, 3] = 1
-    assert dr.grad(t)[0] == pytest.approx(slope(raw, viewmat=right), rel=10 * tol.GRADIENT_REL)
+    viewmat = np.float32(make_sensor_camera().viewmat).astype(np.float64)
+    expected = reference.directional(
+        lambda v: np.sum(expected_image(raw, v["viewmat"])[..., :3] ** 2),
+        {"viewmat": viewmat},
+        {"viewmat": right},
+    )
+    assert dr.grad(t)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
 
 
 @pytest.mark.slow
@@ -163,7 +159,14 @@ INTRINSICS = {
 def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     camera = make_sensor_camera()
     scene = make_mitsuba_scene(to_gaussians(raw))
-    expected = slope(raw, K=INTRINSICS[name](camera.K, camera.width, camera.height))
+    viewmat, K = (np.float32(matrix).astype(np.float64) for matrix in (camera.viewmat, camera.K))
+
+    def loss(values):
+        image = reference.rasterize(raw, values["K"], viewmat, camera.width, camera.height)["color"]
+        return np.sum(to_linear(image) ** 2)
+
+    change = INTRINSICS[name](K, camera.width, camera.height)
+    expected = reference.directional(loss, {"K": K}, {"K": change})
     params = mi.traverse(scene)
     parameter = params[f"sensor.{name}"]
     dr.enable_grad(parameter)
@@ -173,8 +176,38 @@ def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     dr.set_grad(parameter, 1)
     image = mi.render(scene, params)
     dr.forward_to(image)
-    forward = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
-    assert forward == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+    slope = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
+    assert slope == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+
+
+def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
+    """With the same settings, in a fixed order, and through a film that changes nothing."""
+    film = {"rfilter": {"type": "box"}}
+    scene = make_mitsuba_scene(to_gaussians(raw), film, srgb_primitives=False)
+    params = mi.traverse(scene)
+    camera = make_sensor_camera()
+    weight = mi.TensorXf(
+        np.float32(np.random.default_rng(8).normal(size=(camera.height, camera.width, 3)))
+    )
+    names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
+
+    def gradients(image):
+        backward(image * weight)
+        grads = [np.array(dr.grad(params[name])) for name in names]
+        for name in names:
+            dr.set_grad(params[name], 0)
+        return grads
+
+    dr.enable_grad([params[name] for name in names])
+    shape = scene.shapes()[0]
+    splats = gaussian_splat._SceneGaussians(
+        **gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"])
+    )
+    camera = gaussian_splat._sensor_camera(scene.sensors()[0], border=0)
+    plugin = gradients(mi.render(scene, params))
+    direct = gradients(rasterize(splats, camera, ("color",), config=RenderConfig()).color)
+    for name, by_plugin, by_rasterize in zip(names, plugin, direct, strict=True):
+        assert_array_equal(by_plugin, by_rasterize, err_msg=name)
 
 
 def counting_renders(monkeypatch):

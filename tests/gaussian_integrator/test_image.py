@@ -60,6 +60,20 @@ def test_gaussian_splat__channels_agree_with_the_reference_under_their_exr_names
     assert fields == ["R", "G", "B", "A", "motion.X", "motion.Y", "confidence.Y", "depth.Y"]
 
 
+def test_gaussian_splat__writes_aovs_in_the_requested_order(raw):
+    scene = make_mitsuba_scene(to_gaussians(raw), aovs=" depth, motion ")
+    assert scene.integrator().aov_names() == ["depth.Y", "motion.X", "motion.Y"]
+    image = np.asarray(mi.render(scene))
+    assert_array_equal(image[..., 3:], plugin_image(raw, aovs=AOVS)[..., [6, 3, 4]])
+
+
+def test_gaussian_splat__supports_pixel_formats(raw):
+    rgb = plugin_image(raw)
+    luminance = plugin_image(raw, {"pixel_format": "luminance"}, aovs="confidence")
+    assert luminance.shape == (*rgb.shape[:2], 2)
+    assert_close(luminance[..., 0], rgb @ (0.212671, 0.715160, 0.072169), atol=tol.IMAGE_ABS)
+
+
 def test_gaussian_splat__crop_equals_that_of_the_full_image(raw):
     full = plugin_image(raw, aovs=AOVS)
     crop = {"crop_offset_x": 5, "crop_offset_y": 7, "crop_width": 9, "crop_height": 4}
@@ -81,6 +95,12 @@ def test_gaussian_splat__supports_a_field_of_view_along_any_axis(raw, axis):
     }[axis]
     sensor = {"fov_axis": axis, "fov": float(np.rad2deg(2 * np.arctan(0.5 * extent / f)))}
     assert_close(plugin_image(raw, sensor=sensor), plugin_image(raw), atol=tol.IMAGE_ABS)
+
+
+def test_gaussian_splat__composites_over_the_background(raw):
+    image = plugin_image(raw, background={"type": "rgb", "value": [0.2, 0.5, 0.9]})
+    expected = rasterize_view(raw, make_sensor_camera(), (0.2, 0.5, 0.9))["color"]
+    assert_close(image, to_linear(expected), atol=tol.IMAGE_ABS)
 
 
 def test_gaussian_splat__composites_over_an_image(raw):
@@ -119,31 +139,36 @@ def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
     raw = make_unit_scene(degree=2)
     raw["sh_coeffs"][4:, 1:] = 0
     parts = [
-        to_gaussians({name: value[rows] for name, value in raw.items()})
-        for rows in (slice(4), slice(4, None))
+        to_gaussians({k: v[s] for k, v in raw.items()})
+        for s in (slice(0, 4), slice(4, 7), slice(7, None))
     ]
-    constant = replace(parts[1], sh_coeffs=parts[1].sh_coeffs[:, :1])
-    several = mi.load_dict(
+    parts[1] = replace(parts[1], sh_coeffs=parts[1].sh_coeffs[:, :1])
+    parts[2] = replace(parts[2], sh_coeffs=parts[2].sh_coeffs[:, :4])
+    scene = {f"shape{i}": ellipsoids(part) for i, part in enumerate(parts)}
+    scene["shape1"]["type"] = "ellipsoidsmesh"
+    integrator = {"type": "gaussian_splat", "aovs": AOVS}
+    scene = mi.load_dict(
         {
             "type": "scene",
             "sensor": make_sensor_camera().sensor(),
-            "integrator": {"type": "gaussian_splat", "aovs": AOVS},
-            "first": ellipsoids(parts[0]),
-            "second": {**ellipsoids(constant), "type": "ellipsoidsmesh"},
+            "integrator": integrator,
+            **scene,
         }
     )
     one = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
-    results = []
-    for scene, names in ((several, ("first", "second")), (one, ("gaussians",))):
-        params = mi.traverse(scene)
-        data = [params[f"{name}.data"] for name in names]
-        dr.enable_grad(data)
-        image = mi.render(scene, params)
-        backward(dr.square(image[..., :3]))
-        results.append((np.array(image), np.concatenate([np.array(dr.grad(v)) for v in data])))
-    (image, gradient), (expected, expected_gradient) = results
-    assert_close(image, expected, atol=tol.IMAGE_ABS)
-    assert_close(gradient, expected_gradient, rtol=tol.GRADIENT_REL)
+    assert_close(mi.render(scene), mi.render(one), atol=tol.IMAGE_ABS)
+
+    params = mi.traverse(scene)
+    expected = mi.traverse(one)
+    for p, keys in (
+        (params, ["shape0.data", "shape1.data", "shape2.data"]),
+        (expected, ["gaussians.data"]),
+    ):
+        dr.enable_grad([p[key] for key in keys])
+    for s, p in ((scene, params), (one, expected)):
+        backward(dr.square(mi.render(s, p)[..., :3]))
+    gradient = np.concatenate([np.asarray(dr.grad(params[f"shape{i}.data"])) for i in range(3)])
+    assert_close(gradient, dr.grad(expected["gaussians.data"]), rtol=tol.GRADIENT_REL)
 
 
 def test_gaussian_splat__agrees_with_mitsubas_own_integrator():
@@ -192,3 +217,7 @@ def test_gaussian_splat__renders_a_new_attribute_of_the_table(raw):
         rasterize(gaussians, make_sensor_camera(), ("normal",))["normal"],
         atol=tol.IMAGE_ABS,
     )
+    integrator = mi.load_dict({"type": "gaussian_splat", "aovs": "roughness"})
+    bare = make_mitsuba_scene(to_gaussians(raw))
+    with pytest.raises(ValueError, match=r"must have `roughness` \[N, 1\] with N=10, got only"):
+        integrator.render(bare)

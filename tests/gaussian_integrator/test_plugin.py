@@ -10,14 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
-from morgs_mi import ellipsoids
+from morgs_mi import ellipsoids, rasterize
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.ply import write_ply
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
+from tests.gaussian_integrator.expected import to_linear
 from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import make_unit_scene, to_gaussians
 from tests.scenes.plugin import AOVS, make_mitsuba_scene, plugin_image
 from tests.scenes.programs import run_script
@@ -33,11 +35,32 @@ def test_gaussian_splat__writes_undeveloped_renders(raw, tmp_path):
     assert_array_equal(np.array(mi.Bitmap(str(path)))[..., :3], image[..., :3])
 
 
+def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
+    text = """<integrator version="3.0.0" type="gaussian_splat">
+        <string name="aovs" value="depth"/><boolean name="srgb_primitives" value="false"/>
+        <rgb name="background" value="0.1, 0.2, 0.3"/>
+    </integrator>"""
+    integrator = mi.load_string(text)
+    assert_allclose(np.array(integrator.background).ravel(), [0.1, 0.2, 0.3], rtol=1e-6)
+    image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw)), integrator=integrator))
+    expected = np.asarray(
+        rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.1, 0.2, 0.3)).color
+    )
+    assert_close(image[..., :3], expected, atol=tol.IMAGE_ABS)
+
+
 def test_gaussian_splat__ignores_emitters_with_one_warning(raw, caplog):
-    scene = {"type": "scene", "sensor": make_sensor_camera().sensor(), "sky": {"type": "constant"}}
     shape = ellipsoids(to_gaussians(raw))
-    lit = mi.load_dict({**scene, "shape": shape, "integrator": {"type": "gaussian_splat"}})
-    images = [plugin_image(raw), *(np.asarray(mi.render(lit)) for _ in range(2))]
+    sensor = make_sensor_camera().sensor()
+    scene = {
+        "type": "scene",
+        "gaussians": shape,
+        "sensor": sensor,
+        "integrator": {"type": "gaussian_splat"},
+    }
+    dark = mi.load_dict(scene)
+    lit = mi.load_dict({**scene, "sky": {"type": "constant"}})
+    images = [np.asarray(mi.render(s)) for s in (dark, lit, lit)]
     assert_array_equal(images[0], images[1])
     assert [r.getMessage().split(";")[0] for r in caplog.records] == [
         "gaussian_splat ignores the scene's emitters"
@@ -88,6 +111,21 @@ for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):
     lines = run_script(script, check=True).stdout.splitlines()
     shown = [line for line in lines if line.startswith(">")]
     assert shown == ["> False", "> ['depth.Y']", "> []", "> ['depth.Y']"]
+
+
+def test_gaussian_splat__renders_a_shape_after_density_control(raw):
+    """All attributes of a shape may change their length together."""
+    scene = make_mitsuba_scene(to_gaussians(raw))
+    params = mi.traverse(scene)
+    half = {name: value[:5] for name, value in raw.items()}
+    shape = ellipsoids(to_gaussians(half))
+    for name in ("data", "opacities", "sh_coeffs", "motion", "confidence"):
+        params[f"gaussians.{name}"] = shape[name].array
+    params.update()
+    expected = to_linear(
+        np.asarray(rasterize(to_gaussians(half), make_sensor_camera()).color, np.float64)
+    )
+    assert_close(mi.render(scene), expected, atol=tol.IMAGE_ABS)
 
 
 def with_shape(**changes):
@@ -224,6 +262,20 @@ def test_gaussian_splat__renders_a_batch_of_sensors_beside_each_other(raw):
     assert_array_equal(image, expected)
 
 
+@pytest.mark.slow
+def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
+    scene, single_sensors = batch_scene(raw, {})
+    params = mi.traverse(scene)
+    data = params["gaussians.data"]
+    dr.enable_grad(data)
+    backward(dr.square(mi.render(scene, params)))
+    gradient = np.array(dr.grad(data))
+    dr.set_grad(data, 0)
+    for sensor in single_sensors:
+        backward(dr.square(mi.render(scene, params, sensor=sensor)))
+    assert_close(gradient, np.array(dr.grad(data)), rtol=1e-5)
+
+
 def test_gaussian_splat__refuses_a_batch_with_a_border(raw):
     scene, _ = batch_scene(raw, {"sample_border": True, "rfilter": {"type": "gaussian"}})
     with pytest.raises(ValueError, match="a film without `sample_border`, got a `batch` of 3"):
@@ -246,8 +298,11 @@ def test_gaussian_splat__refuses_films_other_than_rgb():
         ({"aovs": "normal"}, "`aovs` must be out of motion, confidence, depth, got 'normal'"),
         ({"max_depth": 3}, "unreferenced property"),
         ({"background": "white"}, "`background` must be one or three finite .* got a str"),
+        ({"background": {"type": "checkerboard"}}, "`background` must be .* got a Texture"),
         ({"srgb_primitives": "false"}, "`srgb_primitives` must be true or false, got 'false'"),
+        ({"surfaces": {"type": "diffuse"}}, "`surfaces` must be an integrator of surfaces"),
         ({"surfaces": {"type": "gaussian_splat"}}, "`surfaces` must be an integrator of surfaces"),
+        ({"type": "splat_path", "clipped": "4"}, "`clipped` must be a finite number"),
         ({"type": "splat_path", "max_depth": 3.5}, "`max_depth` must be a whole number"),
         ({"alpha_min": 2.0}, "gaussian_splat: RenderConfig.*`alpha_min` must be below"),
     ],
@@ -342,6 +397,9 @@ def test_gaussian_splat__renders_a_scene_file_as_the_page_describes(tmp_path, ra
     program = re.search(r'python -c "\n(.*?)"', command, re.DOTALL)[1]
     run_script(program, check=True, cwd=tmp_path, timeout=120)
     channels = read_exr(tmp_path / "image.exr")
-    assert channels.keys() == {"R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"}
-    expected = np.array(mi.render(mi.load_file(str(tmp_path / "scene.xml"))))
-    assert_close(channels["R"], expected[..., 0], atol=1e-6)
+    scene = mi.load_file(str(tmp_path / "scene.xml"))
+    expected = np.array(mi.render(scene))
+    assert expected[..., :3].max() > 0.1
+    names = ["R", "G", "B", *scene.integrator().aov_names()]
+    assert channels.keys() == set(names)
+    assert_close(np.stack([channels[name] for name in names], 2), expected, atol=1e-6)

@@ -11,15 +11,19 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, rasterize
+from tests import tolerances as tol
 from tests.render.exact import (
+    ATTRIBUTES,
     BACKGROUND,
     CONFIG,
+    Activated,
     clear_pixels,
     errors,
     exact_image,
     run,
     weights,
 )
+from tests.scenes.derivatives import tangents
 from tests.scenes.extremes import CASES, REFUSED, eye, random_case, raw_gaussians
 from tests.scenes.gaussians import CHANNELS
 
@@ -42,6 +46,31 @@ def failures(case):
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_rasterize__agrees_with_the_reference_at_the_extremes(case):
     assert not failures(case)
+
+
+@pytest.mark.slow
+def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
+    """<g, J v> = <J' g, v> along the signs of J' g, where nothing cancels."""
+    failed = []
+    for case in CASES:
+        weight = weights(
+            exact_image(case.values, case.camera),
+            np.ones((case.camera.height, case.camera.width), bool),
+        )
+        _, grads = run(case.values, case.camera, weight)
+        gaussians = Activated(case.values)
+        image = rasterize(gaussians, case.camera, CHANNELS, BACKGROUND, config=CONFIG)
+        steps = {}
+        for name in ATTRIBUTES:
+            # Steps as long as the attribute: a unit step of a scale of 1e-38 would overflow.
+            steps[name] = np.sign(grads[name]) * np.minimum(np.abs(case.values[name]), 1e6)
+            grads[name] = np.vdot(grads[name], steps[name])
+        results = tangents(gaussians, steps, [image[name] for name in CHANNELS])
+        forward = sum(np.vdot(t, weight[name]) for t, name in zip(results, CHANNELS, strict=True))
+        reverse = sum(grads.values())
+        if not abs(forward - reverse) <= tol.DUALITY_REL * abs(reverse):
+            failed.append(f"{case.name}: forward {forward:.7g}, reverse {reverse:.7g}")
+    assert not failed
 
 
 @pytest.mark.slow
@@ -87,6 +116,16 @@ def test_rasterize__gradients_of_the_pose_at_the_extremes():
         {"sh_coeffs": np.full((6, 4, 3), 1e18)},
         {"motion": np.full((6, 3), 1e17)},
     ],
+    ids=[
+        "scales",
+        "needles",
+        "opacities",
+        "confidence",
+        "means",
+        "colours below 0",
+        "colours",
+        "motion",
+    ],
 )
 def test_rasterize__raw_extremes_stay_finite(change):
     gaussians = raw_gaussians(**change)
@@ -115,6 +154,11 @@ def fuzz(seeds):
 
 def test_rasterize__fuzz():
     assert not fuzz(range(4))
+
+
+@pytest.mark.slow
+def test_rasterize__fuzz_with_further_seeds():
+    assert not fuzz(range(4, 10))
 
 
 @pytest.mark.long
