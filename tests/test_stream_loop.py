@@ -124,6 +124,24 @@ def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
 
 
 @pytest.mark.slow
+def test_push__stream_carries_births_and_deaths(clip):
+    """Faint ones are pruned, no more are added than the limit allows, ids are never reused, and the
+    decoder has all.
+    """
+    density = DensityConfig(rounds=0, births=0.05, max_gaussians=590, min_error=0, min_opacity=0.3)
+    loop, packets, reports = run(clip, with_fit(density=density))
+    frames = list(coded_frames(packets))
+    for state, next_state, report in zip(frames, frames[1:], reports[1:], strict=False):
+        births = np.setdiff1d(next_state.ids, state.ids)
+        survivors = len(next_state.ids) - len(births)
+        assert births.tolist() == list(range(state.next_id, state.next_id + len(births)))
+        assert 0 < len(births) == min(round(0.05 * len(state.ids)), 590 - survivors)
+        assert report.num_gaussians == len(next_state.ids)
+    assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 590
+    assert_same(frames[-1].gaussians, loop.gaussians)
+
+
+@pytest.mark.slow
 def test_push__fits_views_at_their_own_times(clip):
     """Two of four views are half a frame late and two half a frame early; at the timestamps nobody
     saw the ball.
@@ -148,6 +166,17 @@ def test_push__fits_views_at_their_own_times(clip):
             scores.append(psnr(shown(loop.gaussians, plain[view]), truth / 255, mask))
         quality.append(np.mean(scores))
     assert quality[0] > quality[1] + 1.5
+
+
+@pytest.mark.slow
+def test_push__replaces_too_few_points_and_reports_it(clip, monkeypatch):
+    """Half of the Gaussians are seeded, the others are added by density control."""
+    monkeypatch.setattr("morgs_mi.loop.first_frame.MANY_POINTS", 10**6)  # the images show fewer
+    nothing = np.zeros((0, 3))
+    loop = StreamLoop(cameras()[:4], nothing, nothing, with_fit(density=DensityConfig()))
+    _, report = loop.push(clip[0][:4])
+    assert "too few points (0): 300 more were initialised from" in report.status
+    assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 
 @pytest.mark.slow
@@ -179,16 +208,21 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
     frames = [images[:4] for images in clip]
     frames[1] = [None if view == gone else image for view, image in enumerate(frames[1])]
 
-    missing = [loop.push(images)[1].missing_views for images in frames[1:]]
+    def scores():
+        return [psnr(shown(loop.gaussians, cameras()[4]), images[4] / 255) for images in clip]
+
+    score_list = [scores()]
+    missing = []
+    for images in frames[1:]:
+        missing.append(loop.push(images)[1].missing_views)
+        score_list.append(scores())
     assert missing == [(name,), (), ()]
     flow_views = [{p.camera for p in call.args[0].values()} for call in observe.call_args_list]
     assert [len(views) for views in flow_views] == [2, 2, 2]
     assert [name in views for views in flow_views] == [False, False, True]
-    # The frames after it follow the motion.
-    old_psnr, new_psnr = (
-        psnr(shown(each.gaussians, cameras()[4]), clip[3][4] / 255) for each in (first[0], loop)
-    )
-    assert new_psnr > old_psnr + 3
+    # Every frame follows the motion, from three of four views too: it shows its own timestamp
+    # better than the last did.
+    assert all(score_list[t][t] > score_list[t - 1][t] + 1 for t in (1, 2, 3)), score_list
 
 
 @pytest.mark.slow
@@ -220,10 +254,12 @@ def new(cameras_of_loop=None, points=(), colors=(), **more):
     ("call", "message"),
     [
         (lambda _: new([]), "at least one view"),
+        (lambda _: new(["cam00"]), "`views` must be a .*Camera, got a str"),
         (
             lambda _: new([mi.load_dict(cameras()[0].sensor())]),
             r"got a ProjectiveCamera; convert a Mitsuba sensor by Camera.from_sensor\(\)",
         ),
+        (lambda _: new(config={}), "`config` must be a .*StreamConfig, got a dict"),
         (
             lambda _: new(None, np.full((200, 3), np.nan), np.zeros((200, 3))),
             r"`points` must be finite and at most 1e\+12, got .* at 0",
@@ -240,11 +276,26 @@ def new(cameras_of_loop=None, points=(), colors=(), **more):
             lambda _: new([View(cameras()[1], mask=np.ones((50, 96), bool))]),
             r"view 'cam01': the mask must be bool \[72",
         ),
+        (
+            lambda _: new([View(cameras()[0], mask=np.ones((72, 96), np.uint8))]),
+            "got uint8",
+        ),
         (lambda images: new().push(images[:3]), "one image or None for each of 5 views, got 3"),
+        (lambda _: new().push(None), "one image or None for each of 5 views, got a NoneType"),
         (
             lambda _: new().push([None] * 5),
             "frame 0 must have an image of at least one view, got none",
         ),
+        (
+            lambda images: new().push([i[:50] for i in images]),
+            r"view 'cam00' must be uint8 \[72, 96, 3\]",
+        ),
+        (lambda images: new().push([i.astype(int) for i in images]), "got int64"),
+        (
+            lambda images: new().push([np.full(i.shape, np.nan) for i in images]),
+            "must be finite and at most 1e",
+        ),
+        (lambda _: new().push(["a", *[None] * 4]), "got str; convert it"),
     ],
 )
 def test_stream_loop__refuses_bad_input(clip, call, message):
@@ -275,6 +326,31 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
         assert number < 0.1 * most
     assert 0.1 < moving.active["gaussians"] < 0.9
     assert moving.active["views"] == 1
+
+
+@pytest.mark.slow
+def test_push__skipping_static_views_costs_little_quality(clip):
+    """The held-out image is nearly as good in the mean of eight seeds, in fewer bytes."""
+    quality = np.zeros((8, 2))
+    sizes = np.zeros((8, 2))
+    for seed in range(8):
+        config = dataclasses.replace(QUICK, seed=seed)
+        begun = run(clip, config, frames=1)[0]
+        for column, skip in enumerate((True, False)):
+            loop = new_loop(with_fit(config, skip_static=skip))
+            loop.state = begun.state  # the first frame skips nothing
+            reports = [loop.push(images[:4])[1] for images in clip[1:3]]
+            quality[seed, column] = psnr(shown(loop.gaussians, cameras()[4]), clip[2][4] / 255)
+            sizes[seed, column] = sum(report.num_bytes for report in reports)
+            assert (reports[-1].active["pixels"] < 1) == skip
+    # One seed differs by up to a decibel: five small views, and a first frame that is far from
+    # done. Means of eight were -0.25 to -0.40 dB over successive versions of the method, with a
+    # standard error of 0.16 dB; a mistake in the active set costs whole decibels.
+    gains = quality[:, 0] - quality[:, 1]
+    error = gains.std(ddof=1) / len(gains) ** 0.5
+    assert gains.mean() + 2 * error > -0.3
+    assert gains.mean() > -0.6
+    assert np.all(sizes[:, 0] < 0.9 * sizes[:, 1])
 
 
 def test_step__is_pure_and_complete(clip):
