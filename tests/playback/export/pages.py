@@ -28,7 +28,7 @@ Worker.prototype.postMessage = function (message, ...rest) {
 
 
 class Page:
-    """A page with what it requested and what it reported."""
+    """A page with what it requested and what it reported; it has Playwright's methods, too."""
 
     def __init__(self, browser, address, script="", **context):
         options = {"viewport": {"width": WIDTH, "height": HEIGHT}, **context}
@@ -44,6 +44,9 @@ class Page:
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(address)
+
+    def __getattr__(self, name):
+        return getattr(self.page, name)
 
     def __enter__(self):
         return self

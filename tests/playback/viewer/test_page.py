@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.platform.files import PROVISIONAL
 from morgs_mi.playback.player import picture
 from morgs_mi.playback.streams import open_stream
-from tests.playback.export.pages import HEIGHT, HOLD_FIRST_SORTING, WIDTH, Page
+from tests.playback.export.pages import HEIGHT, WIDTH, Page
 from tests.playback.viewer.serving import decoded, viewing
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import NAMES, rig, splats, write_stream
@@ -33,11 +32,11 @@ class Viewed(Page):
         if expected is None:
             self.wait(READY)
         else:
-            self.page.get_by_text(expected).wait_for()
+            self.get_by_text(expected).wait_for()
 
     def press(self, key, condition="true"):
-        self.page.keyboard.press(key)
-        self.page.wait_for_timeout(500)  # the view rests
+        self.keyboard.press(key)
+        self.wait_for_timeout(500)  # the view rests
         self.wait(f"player.settled && ({condition})")
 
     def shows(self, count):
@@ -46,11 +45,11 @@ class Viewed(Page):
 
     def exact_image(self):
         """Return the exact image that the page shows, as it was sent."""
-        self.page.locator("#rendering").wait_for()
+        self.locator("#rendering").wait_for()
         code = (
             "fetch(document.getElementById('rendering').src).then((answer) => answer.arrayBuffer())"
         )
-        data = self.page.evaluate(f"{code}.then((data) => [...new Uint8Array(data)])")
+        data = self.evaluate(f"{code}.then((data) => [...new Uint8Array(data)])")
         return decoded(bytes(data))
 
 
@@ -86,8 +85,8 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
         viewing(tmp_path) as url,
         Viewed(browser, url, "follow", "the stream has no frame yet") as page,
     ):
-        bar = page.page.locator("#bar").bounding_box()  # of a clip
-        assert page.page.locator("#slider").is_visible()
+        bar = page.locator("#bar").bounding_box()  # of a clip
+        assert page.locator("#slider").is_visible()
         write_stream(
             tmp_path / PROVISIONAL,
             1,
@@ -95,23 +94,23 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
             rig(WIDTH, HEIGHT),
             {**open_stream(tmp_path).metadata, "provisional": {"seconds": 540, "left": 361}},
         )
-        page.page.get_by_text("first frame: 1,200 Gaussians, 9 min, 6 min left").wait_for()
-        assert not page.page.locator("#curve").is_visible(), "there are no recorded images"
+        page.get_by_text("first frame: 1,200 Gaussians, 9 min, 6 min left").wait_for()
+        assert not page.locator("#curve").is_visible(), "there are no recorded images"
         page.wait(READY)
-        assert not page.page.locator("#message").is_visible()
+        assert not page.locator("#message").is_visible()
         provisional = page.image()
         file.write_bytes(complete[: ends[1]])
         (tmp_path / PROVISIONAL).unlink()
-        page.page.get_by_text("Provisional first frame").wait_for(state="hidden")
+        page.get_by_text("Provisional first frame").wait_for(state="hidden")
         page.wait(READY)
         assert not np.array_equal(page.image(), provisional)
-        assert page.page.locator("#bar").bounding_box() == bar
+        assert page.locator("#bar").bounding_box() == bar
         file.write_bytes(complete[: ends[2] + 10])  # and a part of a packet
         page.shows("1 / 1")
-        page.page.get_by_text("truncated or damaged at byte").wait_for()  # nothing follows
+        page.get_by_text("truncated or damaged at byte").wait_for()  # nothing follows
         file.write_bytes(complete[: ends[3]])
         page.shows("2 / 2")
-        assert not page.page.locator("#message").is_visible()
+        assert not page.locator("#message").is_visible()
         page.press("Home")
         file.write_bytes(complete)
         page.shows("0 / 3")  # it stays where it is
@@ -119,18 +118,6 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
         followed = page.image()
     with viewing(clip[0]) as url, Viewed(browser, url, "pause&frame=3") as page:
         assert np.array_equal(page.image(), followed)
-        assert not page.errors
-
-
-def test_page__shows_the_exact_image_until_the_first_sorted_picture(browser, url):
-    with Page(browser, f"{url}#pause&frame=0", HOLD_FIRST_SORTING) as page:
-        page.wait("document.getElementById('poster').naturalWidth > 0")
-        page.wait("!!window.player && player.splats?.spark.sorting")
-        poster = page.image()
-        page.page.evaluate("sortAll()")
-        page.wait(READY)
-        assert not page.page.locator("#poster").is_visible()
-        assert psnr(poster / 255, page.image() / 255) > 22
         assert not page.errors
 
 
@@ -142,14 +129,14 @@ def test_page__starts_again_with_another_stream(browser, tmp_path):
         cameras = tuple(
             look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, 64, 48, ("front", "side"), up=(0, 0, 1))
         )
-        with page.page.expect_navigation():
+        with page.expect_navigation():
             write_stream(tmp_path / "stream.morgs", 3, cameras=cameras)
         page.wait(f"{READY} && player.cameras.length === 2")
         (tmp_path / "stream.morgs").write_bytes(b"something else")
-        page.page.get_by_text("expected a stream, got another file").wait_for()
+        page.get_by_text("expected a stream, got another file").wait_for()
         write_stream(tmp_path / "stream.morgs", 4, cameras=cameras)
         page.wait(f"{READY} && player.frames.length === 4")
-        assert not page.page.locator("#message").is_visible()
+        assert not page.locator("#message").is_visible()
         # The browser's own word on the refusals.
         assert all("status of 400" in error for error in page.errors)
 
@@ -158,19 +145,19 @@ def test_page__wipes_between_the_rendered_and_the_recorded_image(browser, url):
     with Viewed(browser, url, "pause&frame=1&camera=right") as page:
         rendered = page.image()
         page.press("v", RECORDING)
-        page.page.get_by_label("Share of the recorded image").fill("75")
+        page.get_by_label("Share of the recorded image").fill("75")
         image = page.image().astype(int)
         column = WIDTH * 3 // 4
         assert np.abs(image[:90, : column - 3] - RECORDED[1]).max() < 12, (
             "compressed video and JPEG"
         )
         assert np.array_equal(image[:90, column + 3 :], rendered[:90, column + 3 :])
-        page.page.locator("#canvas").focus()
+        page.locator("#canvas").focus()
         page.press("ArrowRight", RECORDING)
         assert np.abs(page.image().astype(int)[:90, : column - 3] - RECORDED[2]).max() < 12
-        page.page.mouse.move(60, 60)  # above the controls
-        page.page.mouse.wheel(0, 500)
-        page.page.locator("#recording").wait_for(state="hidden")
+        page.mouse.move(60, 60)  # above the controls
+        page.mouse.wheel(0, 500)
+        page.locator("#recording").wait_for(state="hidden")
         page.press("r", RECORDING)
         assert not page.errors
 
@@ -187,11 +174,11 @@ def test_page__shows_the_image_of_rasterize_when_the_view_rests(browser, clip, u
                 "the page rounds the camera"
             )
         assert np.array_equal(page.image(), page.exact_image()), "the page shows it pixel by pixel"
-        page.page.mouse.move(WIDTH / 2, 60)
-        page.page.mouse.down()
-        page.page.mouse.move(WIDTH / 2 + 20, 60, steps=2)
-        page.page.locator("#rendering").wait_for(state="hidden")
-        page.page.mouse.up()
+        page.mouse.move(WIDTH / 2, 60)
+        page.mouse.down()
+        page.mouse.move(WIDTH / 2 + 20, 60, steps=2)
+        page.locator("#rendering").wait_for(state="hidden")
+        page.mouse.up()
         page.wait(f"player.settled && {RENDERING}")
         assert not page.errors
 
@@ -202,14 +189,14 @@ def test_page__names_a_damaged_packet(browser, tmp_path):
     data[open_stream(tmp_path).index()[2][2] + 100] ^= 1
     (tmp_path / "stream.morgs").write_bytes(data)
     with viewing(tmp_path) as url, Viewed(browser, url) as page:
-        page.page.keyboard.press("End")
-        page.page.get_by_text("This stream is damaged: frame 2: the packet at byte").wait_for()
-        page.page.evaluate("player.playback.seek(1)")
+        page.keyboard.press("End")
+        page.get_by_text("This stream is damaged: frame 2: the packet at byte").wait_for()
+        page.evaluate("player.playback.seek(1)")
         page.shows("1 / 3")
         assert not page.errors
-        page.page.evaluate("player.frames[1] = 3")
-        page.page.keyboard.press("x")
-        page.page.get_by_text("No exact image: ").wait_for()
+        page.evaluate("player.frames[1] = 3")
+        page.keyboard.press("x")
+        page.get_by_text("No exact image: ").wait_for()
         assert "packet 3 at byte" in page.text("#notes")
 
 
@@ -217,6 +204,6 @@ def test_page__says_that_the_server_has_ended(browser, clip):
     with viewing(clip[0]) as url:
         page = Viewed(browser, url)
     with page:
-        page.page.get_by_text("The server of this page does not answer").wait_for()
+        page.get_by_text("The server of this page does not answer").wait_for()
         page.press("End")
         assert page.text("#count") == "3 / 3"
