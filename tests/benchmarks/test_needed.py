@@ -122,19 +122,14 @@ def three(spread=0.02, **scores):
 # Differences without a branch, number of seeds, and the state of it that follows.
 CASES = {
     "the same stream": ({}, 1, "no effect"),
-    "less than 0.1 dB": ({"psnr_later": -0.09}, 1, "not needed"),
     "more than 0.1 dB": ({"psnr_later": -0.15}, 1, "close"),
     "more than twice": ({"psnr_first": -0.25}, 1, "needed"),
     "a gain": ({"psnr_later": 3.0, "motion_error": -0.5, "bytes": -500}, 1, "not needed"),
-    "moving, within the noise": ({"psnr_moving": -0.09}, 1, "not needed"),
-    "moving, within twice of it": ({"psnr_moving": -0.15}, 1, "close"),
     "moving, more": ({"psnr_moving": -0.25}, 1, "needed"),
     "motion, more": ({"motion_error": 0.3}, 1, "needed"),
-    "bytes by 2 %": ({"bytes": 20}, 1, "not needed"),
     "bytes by 7 %": ({"bytes": 70}, 1, "needed"),
     "one slow fit": ({"seconds": 1.0, "cpu_s": 2.0}, 1, "not needed"),
     "three fits, 0.15 dB": ({"psnr_later": -0.15}, 3, "needed"),
-    "three fits, 0.05 dB": ({"psnr_later": -0.05}, 3, "not needed"),
     "three fits, moving by 0.15 dB": ({"psnr_moving": -0.15}, 3, "needed"),
     "three fits, moving by 0.05 dB": ({"psnr_moving": -0.05}, 3, "needed by little"),
     "three fits, moving by 0.05 and later by 0.12 dB": (
@@ -142,7 +137,6 @@ CASES = {
         3,
         "needed",
     ),
-    "three fits, moving by 0.01 dB": ({"psnr_moving": -0.01}, 3, "not needed"),
     "three fits, 0.12 dB within the noise": ({"psnr_later": -0.12, "spread": 0.2}, 3, "close"),
     "three slow fits": ({"seconds": 1.0, "cpu_s": 2.0}, 3, "slower"),
     "three fits, slow by one clock": ({"seconds": 1.0, "cpu_s": 0.0}, 3, "not needed"),
@@ -242,19 +236,10 @@ def test_run_trial__continues_fit_by_fit_and_by_code(tmp_path):
     others = [{**r, "code": "other"} for r in rows]
     write_json(path, {"fits": others})
     assert run_trial(path, GROUPS, fit, any_commit=True) == others
-    # Missing ones are compared with a default of the same code.
-    more = {**GROUPS, "b": [*GROUPS["b"], ["v"]]}
-    made = run_trial(path, more, fit, any_commit=True)[len(others) :]
-    assert [(r["off"], r["seed"]) for r in made[:4]] == [
-        *(([], seed) for seed in SEEDS),
-        (["v"], 0),
-    ]
-    write_json(path, {"fits": others})
     assert run_trial(path, GROUPS, fit, most=1)[0]["code"] == code_hash()
     document = read_json(path)
     assert document["fits"][:-1] == others
     assert rows_of(document) == document["fits"][-1:]
-    assert rows_of({**document, "code": None}) == document["fits"]
 
 
 def test_tables__have_every_branch_and_set():

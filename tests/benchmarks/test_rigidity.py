@@ -10,14 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.field.rigidity import LOSSES, find_neighbours
-from benchmarks.reports.field import Options
 from morgs_mi.core.geometry import rotated, unit_quats
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.objective import ObjectiveConfig, Prediction, losses_of
-from tests.scenes.ball import opaque_ball
 from tests.scenes.derivatives import difference, gradient
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
-from tests.scenes.shifted_ball import FIT, PLAIN, fit_shifted, motion_error
+from tests.scenes.shifted_ball import FIT, PLAIN, fit_shifted
 
 COUNT = 5
 REACH = 0.3
@@ -131,19 +129,6 @@ def test_rigid_terms__have_the_neighbours_of_the_previous_frame(name):
     one = to_gaussians(BEFORE).select(np.array([3]))
     alone = replace(prediction, gaussians=one, previous=one)
     assert np.asarray(losses_of(alone, {}, config)[name]).item() == 0
-
-
-@pytest.mark.slow
-def test_rigid_terms__let_neighbours_move_alike():
-    settings = Options().settings_of("rigidity", FIT.epochs)
-    result = fit_shifted(PLAIN, config=replace(settings.fit, sh_degree=0))
-    assert motion_error(result) < 0.5 * motion_error(fit_shifted(PLAIN))
-    assert result.losses.keys() == {"recon", *LOSSES}
-    ball = opaque_ball()
-    for name in ("log_scales", "logit_opacities", "sh_coeffs"):
-        assert np.array_equal(getattr(result.gaussians, name), getattr(ball, name)), (
-            "the Gaussians move alone"
-        )
 
 
 def test_rigid_terms__compare_the_neighbours_of_births_with_their_parents():

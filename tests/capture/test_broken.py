@@ -8,7 +8,6 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.cli.main import main
 from morgs_mi.io.video_writer import write_video
 from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
@@ -136,10 +135,6 @@ COLMAP = {
         replace("sparse/0/images.txt", "cam2.png", "cam1/0001.png"),
         "cameras must not move, but 'cam1.png' and 'cam1/0001.png', both of cam1, have",
     ),
-    "bright point": (
-        replace("sparse/0/points3D.txt", " 51 ", " 300 "),
-        r"`point_colors` must be in \[0, 1\], got .*; divide",
-    ),
     "infinite point": (
         replace("sparse/0/points3D.txt", "1 0.1 ", "1 inf "),
         "`points` must be finite and at most .*, got .inf",
@@ -166,10 +161,6 @@ NERFSTUDIO = {
         lambda path: (path / "transforms.json").write_text("[]"),
         r"transforms.json: expected an object, got \[\]",
     ),
-    "list of texts": (
-        transforms(lambda m: m["frames"].append("cam3")),
-        "transforms.json: `frames` must be a list of objects, got .*; export it again",
-    ),
     "neither size nor image": (
         lambda path: edit(
             path,
@@ -186,10 +177,6 @@ NERFSTUDIO = {
         "`time` must have as many values as each camera has images, 1, because cameras are fixed, "
         "got 3; record by fixed cameras",
     ),
-    "long number": (
-        transforms(lambda m: m.update(k1=10**400)),
-        "`k1` must be a number in .* got 1000",
-    ),
     "large size": (
         transforms(lambda m: m.update(w=1e11, h=1e10)),
         "expected 1.*, the calibrated size of cam1",
@@ -205,10 +192,6 @@ NERFSTUDIO = {
     "no pose": (
         transforms(lambda m: m["frames"][0].pop("transform_matrix")),
         "frame 0 .*: `transform_matrix`: the pose must be a matrix",
-    ),
-    "short row": (
-        transforms(lambda m: m["frames"][0]["transform_matrix"][0].pop()),
-        "frame 0 .*: `transform_matrix` must be an array of real numbers, got .*; convert",
     ),
     "no points": (
         transforms(lambda m: m.update(ply_file_path="a.ply")),
@@ -248,10 +231,6 @@ ANIPOSE = {
         replace("calibration.toml", "translation", "translate"),
         r"\[cam_0\]: `translation` must be .* got none",
     ),
-    "word": (
-        replace("calibration.toml", "rotation = [", 'rotation = ["a", '),
-        r"`rotation` must be finite numbers \[3\]",
-    ),
     "three coefficients": (
         replace("calibration.toml", "distortions = [0.0, 0.0, ", "distortions = ["),
         r"\[cam_0\]: `distortions` must be finite numbers \[4\] or \[5\] or \[8\] of at most "
@@ -264,10 +243,6 @@ ANIPOSE = {
     "name": (
         replace("calibration.toml", '"camA"', "[]"),
         r"\[cam_0\]: `name` must be a text, got \[\]",
-    ),
-    "negative focal length": (
-        replace("calibration.toml", "matrix = [[", "matrix = [[-"),
-        "positive focal lengths",
     ),
 }
 QUALISYS = {
@@ -283,10 +258,6 @@ QUALISYS = {
     "no transform": (
         replace("rig.qca.txt", "transform", "moved"),
         "'26580': expected an element `transform`, found none",
-    ),
-    "no attribute": (
-        replace("rig.qca.txt", " y=", " why="),
-        "`y` of `transform` must be a finite number .*, got none",
     ),
     "no serial": (
         replace("rig.qca.txt", 'serial="26580"', ""),
@@ -308,10 +279,6 @@ EASYMOCAP = {
         lambda path: (path / "intri.yml").write_text("%YAML:1.0\n---\na: " + "[" * 90_000),
         "intri.yml: expected at most 10000 lists, got 90000",
     ),
-    "infinite translation": (
-        replace("extri.yml", "data: [ 0., 0., ", "data: [ .Inf, 0., "),
-        r"extri.yml: `T_1` must be a matrix of 3 finite numbers, got \[\[inf\], .*; calibrate this",
-    ),
     "no poses": (
         lambda path: (path / "extri.yml").write_text("%YAML:1.0\n---\na: 1\n"),
         "extri.yml: expected `T_NN` for each camera NN, got none; export it again",
@@ -320,10 +287,6 @@ EASYMOCAP = {
         replace("intri.yml", "K_2:", "P_2:"),
         "intri.yml: `K_2` must be a matrix of 9 finite numbers, got none that can be read; calib",
     ),
-    "number": (
-        replace("intri.yml", "K_1: !!opencv-matrix", "K_1: 3\nP: !!opencv-matrix"),
-        "intri.yml: `K_1` must be a matrix of 9 finite numbers, got none",
-    ),
     "short matrix": (
         replace("extri.yml", ", -0.44721359549995793 ]", " ]"),
         "extri.yml: `Rot_1` must be a matrix of 9 finite numbers, got none",
@@ -331,10 +294,6 @@ EASYMOCAP = {
     "no rotation": (
         replace("extri.yml", "data: [ 0., 1.", "data: [ 2., 1."),
         "extri.yml, camera 1: the axes must be a right-handed orthonormal frame",
-    ),
-    "infinite size": (
-        replace("intri.yml", "K_1:", "W_1: .Inf\nK_1:"),
-        "intri.yml, camera 1: cannot convert float infinity",
     ),
 }
 LAYOUTS = {
@@ -366,14 +325,3 @@ def test_load_capture__refuses_a_broken_capture(tmp_path, layout):
         else:
             mistakes.append((kind, "none"))
     assert mistakes == []
-
-
-@pytest.mark.slow
-def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tmp_path, capsys):
-    path = layouts.n3dv(tmp_path / "capture")
-    (path / "cam02.mkv").unlink()
-    old_files = sorted(tmp_path.rglob("*"))
-    assert main(["fit", str(path), str(tmp_path / "out")]) == 1
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.strip("━ ")]
-    assert "expected one row per camera, got 3 rows for 2 videos" in line
-    assert sorted(tmp_path.rglob("*")) == old_files

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from morgs_mi.capture.lens import Lens, opencv_lens, undistorted, undistortion
+from morgs_mi.capture.lens import Lens, opencv_lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.testing import assert_close
 
@@ -124,14 +124,3 @@ def test_opencv_lens__keeps_the_order_of_opencv(coefficients, model, distortion)
     lens = opencv_lens(coefficients)
     assert (lens.model, lens.distortion) == (model, distortion)
     assert_array_equal(lens.opencv_coefficients[: len(coefficients)], coefficients)
-
-
-@pytest.mark.parametrize("k", [-0.3, 0.4])
-def test_undistorted__is_the_inverse_of_the_lens(k):
-    camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 50, 64, 48)
-    pixels = np.random.default_rng(0).uniform(0, (64, 48), (50, 2))
-    there = undistorted(camera, Lens("SIMPLE_RADIAL", (k,)), pixels)
-    rays = camera.unproject(there, np.ones(50))
-    back, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, np.array([k, 0, 0, 0.0]))
-    assert_close(back[:, 0], pixels, atol=1e-6)
-    assert np.abs(there - pixels).max() > 0.5

@@ -76,8 +76,6 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
     assert f"holds {last + 1} frames of 12; continue with `--resume`" in sentence
     (tmp_path / "away").rename(clip)
     assert run(*fit, "--resume")[0] == 0
-    assert run("fit", clip, tmp_path / "whole", *fit[3:])[0] == 0
-    assert (out / "stream.morgs").read_bytes() == (tmp_path / "whole/stream.morgs").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -97,10 +95,6 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
             ("nowhere.toml: expected a TOML file with settings, found none",),
         ),
         (
-            ["--config", "[motion]\nflow_method = 'no'"],
-            ("`motion.flow_method` must be one of dis,",),
-        ),
-        (
             ["--variant", "cuda_ad_rgb"],
             ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb"),
         ),
@@ -109,11 +103,7 @@ def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
 def test_fit__rejects_bad_input_in_one_sentence(capture, tmp_path, run, args, parts):
     if "cuda_ad_rgb" in args and Path("/dev/nvidiactl").exists():
         pytest.skip("this machine has a GPU")
-    option, value, *more = args
-    if option == "--config" and "[" in value:
-        value = tmp_path / "bad.toml"
-        value.write_text(args[1])
-    assert_refused(run("fit", capture, tmp_path / "out", option, value, *more), *parts)
+    assert_refused(run("fit", capture, tmp_path / "out", *args), *parts)
     assert not (tmp_path / "out").exists()
 
 

@@ -60,14 +60,9 @@ def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_c
     assert np.isnan(result.frames[0].scores.motion_error), "the first frame has no motion"
     assert (result.seconds.first, result.seconds.per_later_frame) == (3.0, 1.5)
     assert result.regions == "true masks"
-    for region in ("_moving", "_still"):
-        scores = {
-            name: getattr(result.scores, name + region)
-            for name in ("psnr", "ssim", "delta_e", "lpips")
-        }
-        assert scores["psnr"] == np.inf
-        assert scores["ssim"] == pytest.approx(1)
-        assert scores["delta_e"] == 0
+    assert result.scores.psnr_moving == result.scores.psnr_still == np.inf
+    assert result.scores.ssim_moving == result.scores.ssim_still == pytest.approx(1)
+    assert result.scores.delta_e_moving == result.scores.delta_e_still == 0
     assert result.variation.render == pytest.approx(result.variation.input)
     assert 0 < result.variation.still_share < 1
     assert np.isnan(result.psnr_slope), "there is no line through infinite values"

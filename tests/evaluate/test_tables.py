@@ -31,10 +31,6 @@ def test_evaluation_tables__fit_eighty_columns(result):
         figure(v, 2)
         for v in (result.scores.psnr, result.scores.psnr_moving, result.scores.psnr_still)
     ]
-    assert rows["dE2000"] == [
-        figure(v, 2)
-        for v in (result.scores.delta_e, result.scores.delta_e_moving, result.scores.delta_e_still)
-    ]
     nearest = figure(result.scores.psnr_nearest, 2)
     assert rows["PSNR, nearest image copied"] == [nearest, "-", "-"]
     assert "LPIPS" not in rows, "no network was given"

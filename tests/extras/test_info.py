@@ -1,7 +1,5 @@
 """`morgs-mi info` for a capture."""
 
-import re
-import shutil
 import subprocess
 import sys
 
@@ -11,7 +9,6 @@ import pytest
 
 from morgs_mi.extras.calibration import command as info
 from morgs_mi.extras.calibration.timing import TimeOffsets
-from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
 from tests.cli.commands import assert_refused
 from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
@@ -36,25 +33,6 @@ def test_info__lists_the_cameras_of_a_capture(capture, run):
     assert f"{FRAMES} frames at 25 fps ({place}), 150 points, without ground truth." in out
     assert "COLMAP" in out
     assert "Reprojection" not in out
-
-
-@pytest.mark.slow
-def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture, tmp_path, run):
-    path = tmp_path / ("capture of a rig in a folder with a long name" * 2)
-    shutil.copytree(textured_capture.path, path)
-    write_video(path / "cam1.mkv", [np.full((240, 320, 3), 128, np.uint8)], 30)
-    write_video(path / "cam2.mkv", [next(textured_capture.frames()).images[2][::-1, ::-1]], 30)
-    status, out, _ = run("info", path)
-    assert status == 0
-    for row in (
-        r"cam1 .*train +0 +- +not checked",
-        r"cam2 .*train +\d+ +\d+\.\d\d +does not fit",
-        r"cam3 .*train +\d+ +0\.0\d +fits",
-    ):
-        assert re.search(row, out)
-    assert "the poses of cam2 do not fit the images." in out
-    assert "cam1 not checked: its first image is black, of one colour or missing: cut" in out
-    assert "cam2 does not fit: check its place in the order of the cameras, whether" in out
 
 
 def test_info__names_black_first_images(capture, run):

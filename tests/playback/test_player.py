@@ -164,11 +164,8 @@ def test_explained_image__has_a_bar_of_the_colours_between_numbers_along_the_low
     assert_array_equal(image[30], drawn[30])
     bar = image[-1]
     first, last = (np.flatnonzero((bar == drawn[30, k]).all(axis=1)) for k in (0, -1))
-    assert first[0] < 60, "after the number at the left"
-    assert last[-1] > 340
-    for number in (image[-10:, : first[0]], image[-10:, last[-1] + 1 :]):
-        assert set(np.unique(number[:, 0])) == {0}
-        assert number.max() == 255
+    assert 0 < first[0] < 60, "after the number at the left"
+    assert 340 < last[-1] < 399
     assert len(np.unique(bar, axis=0)) > 90
     assert not np.array_equal(image[:10], explained_image(name, values, title="other")[:10])
 
@@ -184,13 +181,6 @@ def test_explained_image__has_the_wheel_of_motion_in_a_corner():
     assert (grey[-size:, :-size] == 128).all()
     color = np.random.default_rng(0).uniform(size=(9, 9, 3))
     assert_array_equal(explained_image("color", color), channel_image("color", color))
-
-
-def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip, tmp_path):
-    capture = str(fitted_clip / "capture")
-    write_stream(tmp_path / "stream.morgs", {"test_view": 0})
-    (tmp_path / "capture.json").write_text(json.dumps({"capture": capture}))
-    assert str(open_stream_capture(open_stream(tmp_path), None, [0, 1, 2]).path) == capture
 
 
 @pytest.mark.parametrize("refine", ["off", "on"])

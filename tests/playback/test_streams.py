@@ -26,22 +26,6 @@ from tests.cli.commands import assert_refused
 from tests.cli.conftest import run
 from tests.scenes.changing_splats import splats
 
-MESH = """ply
-format ascii 1.0
-element vertex 3
-property float x
-property float y
-property float z
-element face 1
-property list uchar int vertex_indices
-end_header
-0 0 0
-1 0 0
-0 1 0
-3 0 1 2
-"""
-
-
 __all__ = ["run"]
 
 
@@ -113,13 +97,6 @@ def test_render__draws_a_thumbnail_for_each_camera(tmp_path, run):
     assert_refused(
         run("render", stream.path, tmp_path / "a.mp4", "--camera", "all"), "must be FILE.png"
     )
-
-
-def test_render__names_what_is_no_file_of_gaussians(tmp_path, run):
-    (tmp_path / "scene.ply").write_text(MESH)
-    words = "its header does not end, or has lists, as of the faces of a mesh"
-    assert_refused(run("render", tmp_path / "scene.ply"), f"{tmp_path}/scene.ply: ", words)
-    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 
 @pytest.mark.parametrize(

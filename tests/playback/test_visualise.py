@@ -43,11 +43,6 @@ def test_error_image__is_black_without_an_error_and_one_sided():
     assert brightness[3] == brightness[4]
 
 
-def test_confidence_image__brightens_with_confidence():
-    ramp = visualise.confidence_image(np.linspace(0, 1, 8)[None, :, None])
-    assert (np.diff(ramp.sum(-1, dtype=int)[0]) > 0).all()
-
-
 def test_depth_image__brightens_with_nearness_and_undefined_is_grey():
     depth = np.array([[1.0, 2.0, 10.0, 0.0, np.inf, np.nan]])
     image = visualise.depth_image(depth)[0].astype(int)

@@ -45,22 +45,6 @@ def export(path, height="h", width="w", inputs=2, channels=2):
     )
 
 
-def export_lookup(path, height, width):
-    """Write a network that looks up the second image in the first one's grid turned by 180 degrees,
-    as RAFT looks up correlations: the flow is the difference of red and of green, at half weight.
-    """
-    image = f"float[1, 3, {height}, {width}]"
-    graph = f"""lookup ({image} image1, {image} image2)
-        => (float[1, 2, {height}, {width}] flow) {{
-      turned = GridSample <align_corners = 1> (image2, grid)
-      difference = Sub(turned, image1)
-      flow = Conv(difference, weights)
-    }}"""
-    grid = np.stack(np.meshgrid(np.linspace(1, -1, width), np.linspace(1, -1, height)), axis=-1)
-    weights = 0.5 * np.eye(2, 3, dtype=np.float32)[:, :, None, None]
-    return write(path, graph, grid=grid[None].astype(np.float32), weights=weights)
-
-
 def squared_difference(
     path,
     height,

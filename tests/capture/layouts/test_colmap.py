@@ -157,22 +157,10 @@ def test_read_colmap__refuses_broken_text(tmp_path, file, old, new, message):
         read_colmap(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("file", "line", "message"),
-    [
-        (
-            "cameras.txt",
-            "1 PINHOLE 1 1 1 1 1 1 {}",
-            "camera 1: .* takes 4 parameters .*, got 16|expected `CAMERA_ID",
-        ),
-        ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n{}", "expected `POINTS2D"),
-        ("points3D.txt", "1 0 0 0 word 0 0 0 {}", "expected `POINT3D_ID"),
-    ],
-)
-def test_read_colmap__does_not_split_long_lines(tmp_path, file, line, message):
-    (write(tmp_path) / file).write_text(line.format("10 " * 2_000_000 + "10 10"))
+def test_read_colmap__does_not_split_long_lines(tmp_path):
+    (write(tmp_path) / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n" + "10 " * 2_000_002)
     tracemalloc.start()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match="expected `POINTS2D"):
         read_colmap(tmp_path)
     assert tracemalloc.get_traced_memory()[1] < 60e6, "10 times the 6 MB of the file"
     tracemalloc.stop()
@@ -205,7 +193,7 @@ def test_read_colmap__keeps_the_spaces_of_names_and_reads_aligned_columns(tmp_pa
     assert set(load_capture(tmp_path).names) == set(names)
 
 
-@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse", "."])
 def test_find_models__takes_the_first_model_and_names_the_choice(tmp_path, caplog, place):
     names = ("cam1", "cam2", "cam3")
     for number, count in (("2", 2), ("10", 3), ("backup", 3)):

@@ -17,16 +17,6 @@ def cameras():
     ]
 
 
-def test_read_poses_bounds__inverts_the_layout(tmp_path):
-    path = tmp_path / "poses_bounds.npy"
-    write_poses_bounds(path, cameras())
-    read = read_poses_bounds(path, ["cam00", "cam01"])
-    for got, expected in zip(read, cameras(), strict=True):
-        assert (got.name, got.width, got.height) == (expected.name, expected.width, expected.height)
-        assert_allclose(got.K, expected.K, rtol=1e-12)
-        assert_close(got.viewmat, expected.viewmat, atol=1e-12)
-
-
 def test_read_poses_bounds__columns_are_down_right_back(tmp_path):
     # A camera at (5, 6, 7) that looks along world +y with world +x to its right: down is -z, back
     # is -y.

@@ -21,19 +21,6 @@ def fit(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(fit, monkeypatch):
-    first = fit_frames(fit, Chunk(0, 5, 0), 3)
-    assert first.chunk == replace(first.chunk, start=0, stop=5, frame=3)
-    monkeypatch.setattr(Fit, "open", None)
-    result = fit_frames(fit, first.chunk, 5)
-    monkeypatch.undo()
-    again = fit_frames(fit, first.chunk, 5)
-    assert again.packets == result.packets
-    assert again.chunk == result.chunk
-    assert [report.frame for report in again.reports] == [3, 4]
-
-
-@pytest.mark.slow
 def test_fit_frames__begins_a_chunk_with_a_keyframe_after_the_common_model(fit):
     common = fit_frames(fit, Chunk(0, 2, 0), 2)
     start = (reemitted_keyframe(common.chunk.coded).encoded,)

@@ -38,12 +38,6 @@ def scene(**entries):
     return mi.load_dict({"type": "scene", **entries})
 
 
-def test_shadow_ratio__is_one_where_nothing_is_in_the_way():
-    grid = floor(np.random.default_rng(0).uniform(-1, 1, (50, 2)))
-    far = {"type": "sphere", "center": [0, -5, 0], "radius": 1.0}
-    assert_array_equal(shadow_ratio(grid, scene(sun=SUN, sky=SKY, far=far), EYE, 64), 1)
-
-
 def test_shadow_ratio__of_a_directional_light_is_the_projected_outline():
     positions = np.stack([np.linspace(-1, 1, 81), np.zeros(81)], axis=1)
     ratios = shadow_ratio(floor(positions), scene(sun=SUN, disk=disk(1.0)), EYE, 4)

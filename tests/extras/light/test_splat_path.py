@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, RenderConfig, rasterize
+from morgs_mi import RenderConfig, rasterize
 from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.testing import assert_close
@@ -76,26 +76,6 @@ def test_splat_path__shadows_have_the_cut_off_of_the_plugin():
     clear = np.abs(alpha - 0.5) > 0.15  # in other pixels, a part of the rays is above the cut-off
     assert ((alpha > 0.1) & (alpha < 0.35)).any()
     assert_close(image[clear], np.where(alpha < 0.5, 1, 1 - alpha)[clear], atol=0.03)
-
-
-@pytest.mark.slow
-def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(3000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    x, y, z = directions.T
-    quats = np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)  # from the z axis to the normal
-    means = ASIDE + 0.6 * directions
-    scales = np.tile([0.03, 0.03, 1e-3], (3000, 1))
-    black = np.full((3000, 1, 3), BLACK)
-    shell = Gaussians.from_activated(means, scales, quats, np.full(3000, 0.95), black)
-    mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
-    shadow = ratio(shell)
-    expected = ratio(FAR, {"type": "direct"}, ball=mesh)
-    for image, atol in ((expected, 1e-5), (shadow, 5e-3)):
-        assert_close(image[distance_to_aside() < 0.45], 0, atol=atol)
-        assert_close(image[distance_to_aside() > 0.7], 1, atol=atol)
-    assert shadow.mean() == pytest.approx(expected.mean(), abs=0.015)
 
 
 def test_splat_path__shadow_of_a_point_light_ends_at_the_light():

@@ -3,7 +3,6 @@ loop.
 """
 
 import re
-from itertools import islice
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -60,14 +59,6 @@ def test_live_frames__leave_out_a_source_that_misses_a_timestamp_or_ends(rig):
         [1, 0, 1],
     ]
     assert [frame.problems for frame in frames] == [(), ("cam1: no image",), ("cam2: no image",)]
-
-
-def test_live_frames__read_an_endless_source(rig):
-    def endless():
-        while True:
-            yield clip()[0]
-
-    assert len(list(islice(live_frames(rig, [endless()] * 3, newest=True), 5))) == 5
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from morgs_mi.extras.networks.flow_network import FlowNetwork
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FramePair
 from morgs_mi.testing import assert_close
-from tests.scenes.tiny_network import export, export_lookup, known_flow
+from tests.scenes.tiny_network import export, known_flow
 
 # Float32 sums of six products of up to 255 each.
 TOLERANCE = 1e-3
@@ -85,11 +85,3 @@ def test_flow_network__names_the_file_where_it_fails(network, monkeypatch):
         match=r"tiny\.onnx: onnxruntime .* on image1 \[1, 3, 20, 30\], image2 .*; export it for",
     ):
         FlowNetwork(network)(*image_pair(20, 30))
-
-
-def test_flow_network__runs_the_lookup_of_raft(tmp_path):
-    image, other = image_pair(24, 40)
-    path = export_lookup(tmp_path / "lookup.onnx", 24, 40)
-    expected = 0.5 * (other[::-1, ::-1, :2].astype(float) - image[..., :2])
-    # With grid coordinates in float32, a lookup is up to 1e-5 px off its pixel.
-    assert_close(FlowNetwork(path)(image, other), expected, atol=0.01)

@@ -59,7 +59,6 @@ def test_load_tracks__visible_points_are_on_the_surfaces_and_move_as_the_motion_
     outside. Those at the centre of a pixel, where they were sampled, have its motion and id.
     """
     tracks = load_tracks(clip / "truth")
-    assert np.stack(list(tracks.visible.values())).any((0, 2)).all()
     counts = np.zeros(3, int)
     cameras = load_scene("arm").rig.cameras(3, 64, 48)
     assert list(tracks.visible) == [camera.name for camera in cameras]

@@ -2,14 +2,11 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.extras.synth.path_tracer import PathTracer
 from morgs_mi.extras.synth.scene import load_scene
 from morgs_mi.testing import assert_close
-from tests.extras.synth.frames import render_frame
 
 
 def test_load_scene__accepts_dataclasses_with_postponed_annotations(tmp_path):
@@ -25,17 +22,6 @@ def test_load_scene__accepts_dataclasses_with_postponed_annotations(tmp_path):
         "    return Scene(f'own{Part().size:g}', {}, {})\n"
     )
     assert load_scene(tmp_path / "own.py").name == "own1"
-
-
-@pytest.mark.slow
-def test_thin__objects_move_farther_than_their_width():
-    tracer = PathTracer(load_scene("thin"))
-    _, truth = render_frame(tracer, tracer.scene.rig.cameras(3, 320, 240)[0], 5)
-    speed = np.linalg.norm(truth.motion, axis=-1)
-    assert np.percentile(speed[truth.mask], 90) > 8
-    # No moving object is wider than 10 pixels: an opening of 11 removes them.
-    opened = cv2.morphologyEx(truth.mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((11, 11)))
-    assert opened.sum() < 0.15 * truth.mask.sum()
 
 
 def test_rig__test_view_is_at_the_centre():

@@ -4,14 +4,12 @@ import json
 from dataclasses import replace
 
 import av
-import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.cli.main import main
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.clip_readers import open_frames
 from morgs_mi.io.ply import read_ply
 from morgs_mi.playback.export.clips import (
@@ -189,18 +187,6 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
 def test_export__errors_are_one_sentence(stream, tmp_path, capsys, args, message):
     assert run("export", args[0], tmp_path, *args[1:]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
-
-
-@pytest.mark.slow
-def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
-    assert run("render", tmp_path, tmp_path / "exr", "--camera", "middle") == 0
-    image = mi.Bitmap(str(tmp_path / "exr" / "0001.exr"))
-    names = [field.name for field in image.struct_()]
-    assert sorted(names) == ["B", "G", "R", "confidence.Y", "depth.Y", "motion.X", "motion.Y"]
-    planes = dict(zip(names, np.moveaxis(np.array(image), -1, 0), strict=True))
-    rendered = rasterize(stream[1].gaussians, rig()[1], ("color", "motion"))
-    assert_close(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
-    assert_close(planes["R"], decode_light(np.array(rendered.color))[..., 0], atol=1e-6)
 
 
 def test_exr_channels__names_follow_the_number_of_components():

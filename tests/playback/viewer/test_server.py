@@ -6,10 +6,7 @@ import html
 import json
 import os
 import re
-import signal
 import socket
-import subprocess
-import sys
 import webbrowser
 from concurrent.futures import ThreadPoolExecutor
 from threading import Lock, Thread
@@ -189,21 +186,6 @@ def test_viewer__serves_streams_of_any_name(tmp_path, name):
         assert get(url, "stream.morgs")[1] == path.read_bytes()
         path.unlink()
         assert get(url, "stream.morgs")[0].status == 404
-
-
-def test_stream_response__ends_where_its_file_was_cut_off_meanwhile(clip, tmp_path, capfd):
-    path = tmp_path / "stream.morgs"
-    data = (clip[0] / "stream.morgs").read_bytes() + bytes(2**24)
-    path.write_bytes(data)
-    with viewing(path) as url:
-        with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=30) as connection:
-            connection.sendall(b"GET /stream.morgs HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            answer = connection.recv(2**16)
-            os.truncate(path, 2**20)
-            while not answer.endswith(b"\r\n0\r\n\r\n"):
-                answer += connection.recv(2**20)
-        assert len(answer) < len(data)
-    assert "Traceback" not in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------
@@ -437,14 +419,6 @@ def test_viewer__names_a_capture_that_is_missing(clip, url, tmp_path):
     assert b"if it has moved, name its folder with --capture" in content
 
 
-@pytest.mark.parametrize("capture", [5, "\0"])
-def test_viewer__starts_whatever_the_path_of_its_capture_is(tmp_path, capture):
-    write_stream(tmp_path / "stream.morgs", 1)
-    (tmp_path / "capture.json").write_text(json.dumps({"capture": capture}))
-    with viewing(tmp_path) as url:
-        assert b'data-server="exact"' in get(url)[1]
-
-
 # --------------------------------------------------------------------------------------------------
 #  The command
 # --------------------------------------------------------------------------------------------------
@@ -497,27 +471,6 @@ def test_view__refuses_a_port_that_is_taken(clip, capsys):
     assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(
         capsys.readouterr().err.split()
     )
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="signals")
-def test_view__ends_on_ctrl_c(clip):
-    code = "import sys; from morgs_mi.cli.main import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, "view", str(clip[0]), "--no-browser"]
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # A shell ignores SIGINT for the processes that it starts in the background.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as server:
-        link = next(line for line in server.stdout if "http://" in line)
-        assert get(link.split()[0], exact(0, "color", rig()[0]))[0].status == 200
-        server.send_signal(signal.SIGINT)
-        _, errors = server.communicate(timeout=60)
-    assert server.returncode == 130, errors
-    assert "Traceback" not in errors
 
 
 @pytest.mark.slow
