@@ -20,7 +20,6 @@ from morgs_mi.playback.visualise import write_png
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.quick import OPTIONS
-from tests.scenes.captures import colmap
 from tests.scenes.noise_capture import FRAMES, rig, truncate_clip
 from tests.scenes.recording import write_recording
 
@@ -141,21 +140,6 @@ def fitted_capture(monkeypatch, run, capture, out, *args):
     monkeypatch.setattr("morgs_mi.runs.fit_capture.stream_capture", stop)
     assert run("fit", capture, out, *args)[0] == 130
     return passed[0]
-
-
-def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path, run, monkeypatch):
-    clip = colmap(tmp_path / "clip")  # 62x46
-    assert_refused(
-        run("fit", clip, tmp_path / "out", "--downscale", 1.5),
-        "`downscale` must leave images of at least 32 pixels on each side, got 1.5; use at most "
-        "1.43.",
-    )
-    assert (
-        fitted_capture(monkeypatch, run, clip, tmp_path / "out", "--downscale", 1.43)
-        .cameras[0]
-        .height
-        == 32
-    )
 
 
 def clean_up(*_):

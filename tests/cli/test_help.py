@@ -34,13 +34,6 @@ def test_main__ends_silently_if_the_reader_of_its_output_has():
     assert (result.returncode, result.stderr) == (141, b"")
 
 
-def test_main__writes_the_completion_of_a_shell(tmp_path):
-    with pytest.raises(SystemExit) as stop:
-        main(["--tyro-write-completion", "bash", str(tmp_path / "morgs-mi.bash")])
-    assert not stop.value.code
-    assert "morgs-mi" in (tmp_path / "morgs-mi.bash").read_text()
-
-
 @pytest.mark.parametrize(
     ("words", "parts"),
     [

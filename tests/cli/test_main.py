@@ -20,13 +20,6 @@ from tests.scenes.noise_capture import rig
 COMMON = {"--help", "--variant", "--debug"}
 
 
-def test_main__names_a_missing_capture(tmp_path, run):
-    path = tmp_path / "nowhere"
-    for args in (("info", path), ("fit", path, tmp_path / "out", *OPTIONS)):
-        assert_refused(run(*args), "expected a capture folder", str(path))
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("args", "parts"),
     [

@@ -1,8 +1,5 @@
 """`morgs-mi info` for a capture."""
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -12,17 +9,6 @@ from morgs_mi.extras.calibration.timing import TimeOffsets
 from morgs_mi.playback.visualise import write_png
 from tests.cli.commands import assert_refused
 from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("option", ["--no-check", "--help"])
-def test_info__names_standard_output_if_it_is_full(capture, option):
-    with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "morgs_mi", "info", str(capture), option]
-        result = subprocess.run(
-            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
-    assert (result.returncode, result.stderr) == (1, "standard output: No space left on device.\n")
 
 
 def test_info__lists_the_cameras_of_a_capture(capture, run):

@@ -69,15 +69,6 @@ def test_write_ply__stores_the_attributes_of_mitsuba(tmp_path):
             assert_close(attributes[name], np.ravel(value), atol=2e-6)  # of the unit quaternions
 
 
-def test_read_ply__refuses_an_odd_number_of_coefficients_of_mitsuba(tmp_path):
-    write_ply(tmp_path / "g.ply", to_gaussians(make_unit_scene(1)), layout="mitsuba")
-    records = PlyData.read(tmp_path / "g.ply")["vertex"].data
-    records = without(*(f"sh_coeffs_{i}" for i in range(10, 12)))(records)
-    PlyData([PlyElement.describe(records, "vertex")]).write(str(tmp_path / "h.ply"))
-    with pytest.raises(ValueError, match="expected f_rest_0 to f_rest_8"):
-        read_ply(tmp_path / "h.ply")
-
-
 def test_read_ply__names_an_invalid_motion(tmp_path):
     raw = make_unit_scene()
     raw["motion"][3, 1] = np.nan

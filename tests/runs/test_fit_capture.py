@@ -29,7 +29,7 @@ from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next, with_points
 from morgs_mi.runs.fit_files import Recording as Files
-from morgs_mi.runs.fit_files import read_reports, stream_metadata
+from morgs_mi.runs.fit_files import check_same_fit, read_reports, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.captures import colmap
 from tests.scenes.recording import CONFIG, FRAMES, recording, write_recording
@@ -333,6 +333,15 @@ def test_stream_metadata__has_no_path(tmp_path):
     assert "jane" not in json.dumps(header)
     assert header["config"]["motion"]["flow_method"] == "files:flow"
     assert header["config"]["motion"]["mask_method"] == "sam2:encoder.onnx,decoder.onnx"
+
+
+def test_check_same_fit__allows_a_path_in_the_header(whole, tmp_path):
+    """As the headers of earlier versions have; the recording may have moved."""
+    reader = StreamReader(whole / "stream.morgs")
+    metadata = {**reader.metadata, "capture": "/elsewhere"}
+    with StreamWriter(tmp_path / "old.morgs", reader.cameras, reader.fps, metadata):
+        pass
+    check_same_fit(StreamReader(tmp_path / "old.morgs"), recording(), reader.metadata)
 
 
 def test_stream_capture__resumes_beside_a_hostile_description(whole, tmp_path):

@@ -12,7 +12,7 @@ from morgs_mi.extras.live.live_config import LIVE_STREAM
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.platform.files import PROVISIONAL
 from morgs_mi.playback.streams import open_stream
-from tests.cli.commands import assert_refused, interrupt
+from tests.cli.commands import interrupt
 from tests.cli.test_settings import check_help
 from tests.quick import OPTIONS
 from tests.scenes import noise_capture
@@ -63,18 +63,6 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture, tmp_path, videos, run, mon
     assert status == 0
     assert "fitted 1 of 1 frames (0 dropped) in 0.0 s" in printed
     assert "Interrupted" not in error
-
-
-@pytest.mark.parametrize(
-    ("args", "part"),
-    [
-        ((), "`camera` must have a source per camera, got none"),
-        (("--timeout", 1e18), "`timeout` must be above 0 and at most 1000000, got 1e+18"),
-    ],
-)
-def test_Live__refuses_in_one_sentence(capture, tmp_path, run, args, part):
-    assert_refused(run("live", tmp_path / "out", "--calibration", capture, *args), part)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

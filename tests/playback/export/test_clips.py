@@ -150,6 +150,12 @@ def test_render__writes_videos_that_players_open(stream, tmp_path, name, codec):
         assert data.index(b"moov") < data.index(b"mdat")
 
 
+def test_export_video__repeats_a_short_clip(stream, tmp_path):
+    assert run("export", "video", tmp_path, "--least-seconds", 1, "--width", 32) == 0
+    # Three plays of 4 frames at 10 frames per second.
+    assert open_frames(tmp_path / "between.mp4").num_frames == 12
+
+
 def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     more = ("--freeze", 2, "--seconds", 0.5, "--width", 32, "--channels", "color", "depth")
     assert run("export", "video", tmp_path, "--path", "orbit", *more) == 0
