@@ -9,7 +9,7 @@ from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.extras.synth.ground_truth import compute_ground_truth
 from morgs_mi.extras.synth.path_tracer import PathTracer
-from morgs_mi.extras.synth.scene import Object, Scene, translate
+from morgs_mi.extras.synth.scene import Object, Scene, load_scene, translate
 from tests.extras.synth.frames import render_frame
 
 
