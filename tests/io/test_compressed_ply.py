@@ -73,7 +73,7 @@ def test_write_compressed_ply__has_the_bits_of_the_layout(tmp_path):
     assert rotations[2] >> 30 == 3
     assert rotations[2] & 1023 == pytest.approx(low, abs=1)
     colors = [color.to_bytes(4, "big") for color in vertices["packed_color"].tolist()]
-    assert [[*color] for color in colors] == [[0, 255, 0, 0], [255, 255, 0, 128], [153, 0, 0, 255]]
+    assert [[*color] for color in colors] == [[0, 0, 0, 0], [255, 255, 0, 128], [153, 128, 0, 255]]
 
 
 def test_write_compressed_ply__has_bounds_for_each_256(tmp_path):
