@@ -193,6 +193,10 @@ NERFSTUDIO = {
         transforms(lambda m: m["frames"][0].pop("transform_matrix")),
         "frame 0 .*: `transform_matrix`: the pose must be a matrix",
     ),
+    "short row": (
+        transforms(lambda m: m["frames"][0]["transform_matrix"][0].pop()),
+        "frame 0 .*: `transform_matrix` must be an array of real numbers, got .*; convert",
+    ),
     "no points": (
         transforms(lambda m: m.update(ply_file_path="a.ply")),
         "a.ply: expected the points' PLY file, found",
@@ -216,6 +220,10 @@ DYNAMIC3DGS = {
         meta(lambda m: m["cam_id"][1].__setitem__(0, 7)),
         "`cam_id` must name each camera of .*, got another camera in frame 1",
     ),
+    "other camera": (
+        meta(lambda m: m["cam_id"][1].__setitem__(0, 7)),
+        "after 2 frames .`cam_id` must name each camera of",
+    ),
     "long pose": (
         meta(lambda m: m["w2c"][1][0][0].__setitem__(0, 10**400)),
         "train_meta.json: `w2c` must be an array of real numbers",
@@ -230,6 +238,10 @@ ANIPOSE = {
     "no pose": (
         replace("calibration.toml", "translation", "translate"),
         r"\[cam_0\]: `translation` must be .* got none",
+    ),
+    "word": (
+        replace("calibration.toml", "rotation = [", 'rotation = ["a", '),
+        r"`rotation` must be finite numbers \[3\]",
     ),
     "three coefficients": (
         replace("calibration.toml", "distortions = [0.0, 0.0, ", "distortions = ["),
@@ -258,6 +270,10 @@ QUALISYS = {
     "no transform": (
         replace("rig.qca.txt", "transform", "moved"),
         "'26580': expected an element `transform`, found none",
+    ),
+    "no attribute": (
+        replace("rig.qca.txt", " y=", " why="),
+        "`y` of `transform` must be a finite number .*, got none",
     ),
     "no serial": (
         replace("rig.qca.txt", 'serial="26580"', ""),

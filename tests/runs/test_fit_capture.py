@@ -359,9 +359,10 @@ def test_stream_capture__resumes_beside_a_hostile_description(whole, tmp_path):
             f'{{"frames": [{{"seconds": {10**400}}}]}}',
             "expected the report of 6 frames, got none or a broken one",
         ),
+        ('{"frames": []}', "expected the report of 6 frames, got none or a broken one .0 rows"),
         (None, "expected the report of 6 frames, got none or a broken one"),
     ],
-    ids=["broken", "large", "missing"],
+    ids=["broken", "large", "empty", "missing"],
 )
 def test_stream_capture__refuses_a_hostile_or_missing_report(whole, tmp_path, text, message):
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
