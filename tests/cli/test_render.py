@@ -11,6 +11,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.exr import read_exr
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
 from tests.scenes.changing_splats import write_stream
+from tests.scenes.full_disk import files_end_at
 from tests.scenes.noise_capture import rig
 
 
@@ -66,6 +67,17 @@ def test_outputs_between_the_cameras__say_once_what_the_fit_expects(
     status, output, _ = run(command, *kind, stream, *options)
     assert status == 0
     assert output.count("Views between the cameras: poor (58 degrees apart).") == 1
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "exr"])
+def test_render__removes_its_output_on_a_full_disk(stream, tmp_path, run, name):
+    # Compiled kernels are cached on disk too.
+    run("render", stream, tmp_path / f"warm-{name}", "--camera", 0)
+    with files_end_at(200):
+        status, _, error = run("render", stream, tmp_path / name, "--camera", 0)
+    assert status == 1
+    assert_one_sentence(error, name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["good.morgs", f"warm-{name}"]
 
 
 def test_render__removes_its_output_when_interrupted(stream, tmp_path, run, monkeypatch):

@@ -11,6 +11,8 @@ import struct
 import subprocess
 import sys
 import termios
+import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,20 +24,23 @@ from morgs_mi.cli.main import COMMANDS, main
 NAMES = [(), *((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]
 
 
-def on_terminal(columns: int, *args: str | Path) -> str:
-    """Return what a command prints on a terminal, with its colours."""
+def parts_on_terminal(columns: int, *args: str | Path) -> Iterator[bytes]:
+    """Yield what a command prints on a terminal, when it does."""
     parent, child = pty.openpty()
     fcntl.ioctl(child, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
     environment = {k: v for k, v in os.environ.items() if k != "COLUMNS"} | {"TERM": "xterm"}
     command = [sys.executable, "-m", "morgs_mi", *map(str, args)]
-    printed = b""
     with subprocess.Popen(command, stdin=child, stdout=child, stderr=child, env=environment):
         os.close(child)
         with suppress(OSError):  # the process has ended
             while part := os.read(parent, 2**16):
-                printed += part
+                yield part
     os.close(parent)
-    return printed.decode().replace("\r", "\n")
+
+
+def on_terminal(columns: int, *args: str | Path) -> str:
+    """Return what a command prints on a terminal, with its colours."""
+    return b"".join(parts_on_terminal(columns, *args)).decode().replace("\r", "\n")
 
 
 @pytest.mark.parametrize("columns", [80, 100])
@@ -72,3 +77,26 @@ def test_commands__print_whole_words_on_a_terminal(columns, fitted_clip, tmp_pat
         lines = [line for line in text.splitlines() if " " in line.strip()]
         assert max(map(len, lines)) <= columns, text
         assert "Traceback" not in text
+
+
+QUICK_SWEEP = "--presets default --epochs 1 --first-frame-steps 60 --seeds 1 --frames 2"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "words"), [("fit", ""), ("sweep", QUICK_SWEEP)])
+def test_bars__change_a_cell_within_ten_seconds(name, words, fitted_clip, tmp_path):
+    config = tmp_path / "few.toml"
+    config.write_text("fit.num_gaussians = 500\nfit.first_frame_steps = 100\n")
+    places = (fitted_clip / "capture", tmp_path / "out")
+    options = [*words.split(), "--config", config]
+    shown = ""
+    gaps = []
+    begin = time.monotonic()
+    for part in parts_on_terminal(100, name, *places, *options):
+        text = re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", part.decode(errors="replace"))
+        if text != shown:
+            gaps.append(time.monotonic() - begin)
+            begin = time.monotonic()
+        shown = text
+    assert (places[1] / {"fit": "report.json", "sweep": "sweep.json"}[name]).exists()
+    assert max(gaps) < 10

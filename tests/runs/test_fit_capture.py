@@ -19,6 +19,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.frame_source import play
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.view import Views
 from morgs_mi.fit.fit_config import ShortFitConfig
@@ -29,10 +30,13 @@ from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.stream_header import as_fitted, open_stream_capture
 from morgs_mi.runs.fit_capture import stream_capture, with_next, with_points
 from morgs_mi.runs.fit_files import Recording as Files
-from morgs_mi.runs.fit_files import check_same_fit, read_reports, stream_metadata
+from morgs_mi.runs.fit_files import read_reports, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
+from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
+from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, FRAMES, recording, write_recording
+from tests.scenes.short_clip import Clip, pieces_of
 
 # About what the fit takes here; on a slower machine all kills come early.
 SECONDS = 0.8
@@ -134,6 +138,34 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(whole, tmp_p
     assert files_of(out) == files_of(whole)
     stream_capture(recording(), out, CONFIG, resume=True)
     assert files_of(out) == files_of(whole)
+
+
+@pytest.mark.slow
+def test_stream_capture__replaces_an_earlier_fit_together(whole, tmp_path):
+    out = tmp_path / "out"
+    push = StreamLoop.push
+    frames = []
+    shutil.copytree(whole, out)
+
+    def spy(loop, *args):
+        if frame := loop.state.frame:
+            metadata = read_json(out / "capture.json")
+            rows = report_of(out)["frames"]
+            held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
+            frames.append(
+                (
+                    Path(metadata["capture"]).name,
+                    report_of(out)["config"]["seed"],
+                    len(rows),
+                    len(held),
+                )
+            )
+            assert len(rows) == frame
+        return push(loop, *args)
+
+    other_fit(out, spy)
+    assert frames == [("other", 1, frame, frame) for frame in range(1, FRAMES)]
+    assert sorted(files_of(out)) == ["capture.json", "report.json", "stream.morgs"]
 
 
 @pytest.mark.slow
@@ -291,7 +323,7 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["removed", "replaced"])
+@pytest.mark.parametrize("change", ["removed", "moved", "replaced"])
 def test_stream_capture__ends_when_its_stream_is_taken_away(whole, tmp_path, change):
     out = tmp_path / "out"
     reports = []
@@ -303,9 +335,13 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole, tmp_path, cha
         reports.append(frame)
         if frame != 2:
             return
-        (out / "stream.morgs").unlink()
-        if change == "replaced":
-            shutil.copy(whole / "stream.morgs", out)
+        if change == "removed":
+            (out / "stream.morgs").unlink()
+        elif change == "replaced":
+            shutil.copy(whole / "stream.morgs", tmp_path / "other")
+            (tmp_path / "other").replace(out / "stream.morgs")
+        else:
+            out.rename(tmp_path / "moved")
 
     place = "another file" if change == "replaced" else "none"
     with pytest.raises(
@@ -316,6 +352,10 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole, tmp_path, cha
     assert max(reports) == 2
     if change == "replaced":
         assert stream_of(out) == stream_of(whole)
+    elif change == "moved":
+        assert not out.exists()
+        stream_capture(recording(), tmp_path / "moved", CONFIG, resume=True)
+        assert_same(tmp_path / "moved", whole)
 
 
 def test_stream_metadata__has_no_path(tmp_path):
@@ -335,13 +375,21 @@ def test_stream_metadata__has_no_path(tmp_path):
     assert header["config"]["motion"]["mask_method"] == "sam2:encoder.onnx,decoder.onnx"
 
 
-def test_check_same_fit__allows_a_path_in_the_header(whole, tmp_path):
+@pytest.mark.slow
+def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole, tmp_path):
     """As the headers of earlier versions have; the recording may have moved."""
     reader = StreamReader(whole / "stream.morgs")
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
     metadata = {**reader.metadata, "capture": "/elsewhere"}
-    with StreamWriter(tmp_path / "old.morgs", reader.cameras, reader.fps, metadata):
-        pass
-    check_same_fit(StreamReader(tmp_path / "old.morgs"), recording(), reader.metadata)
+    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, metadata) as writer:
+        for packet in list(reader)[:3]:
+            writer.write(packet)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(
+        coded_frames(reader)
+    )
+    assert read_json(out / "capture.json")["capture"] == str(Path("noise").resolve())
 
 
 def test_stream_capture__resumes_beside_a_hostile_description(whole, tmp_path):
@@ -355,14 +403,14 @@ def test_stream_capture__resumes_beside_a_hostile_description(whole, tmp_path):
     ("text", "message"),
     [
         ("{", "expected JSON, got a broken file"),
+        ('{"frames": []}', "expected the report of 6 frames, got none or a broken one .0 rows"),
         (
             f'{{"frames": [{{"seconds": {10**400}}}]}}',
             "expected the report of 6 frames, got none or a broken one",
         ),
-        ('{"frames": []}', "expected the report of 6 frames, got none or a broken one .0 rows"),
         (None, "expected the report of 6 frames, got none or a broken one"),
     ],
-    ids=["broken", "large", "empty", "missing"],
+    ids=["broken", "empty", "large", "missing"],
 )
 def test_stream_capture__refuses_a_hostile_or_missing_report(whole, tmp_path, text, message):
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
@@ -371,6 +419,24 @@ def test_stream_capture__refuses_a_hostile_or_missing_report(whole, tmp_path, te
         (out / "report.json").write_text(text)
     with pytest.raises(ValueError, match=f"report.json: {message}"):
         stream_capture(recording(), out, CONFIG, resume=True)
+
+
+@pytest.mark.slow
+def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole, tmp_path):
+    clip = Clip(stream_of(whole), pieces_of(stream_of(whole)), {})
+    out = tmp_path / "out"
+    for case in range(12):
+        forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
+        forged = forge(clip, np.random.default_rng(case))
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(whole, out)
+        (out / "stream.morgs").write_bytes(forged)
+        refusal = ""
+        try:
+            stream_capture(recording(), out, CONFIG, resume=True)
+        except ValueError as error:
+            refusal = str(error)
+        assert refusal.startswith(f"{out}/") or StreamReader(out / "stream.morgs").seek(FRAMES - 1)
 
 
 def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path):
@@ -397,9 +463,12 @@ def test_with_points__does_not_use_points_that_no_camera_sees(tmp_path, caplog):
 
 
 def test_read_reports__reads_frames_without_a_psnr(tmp_path):
-    row = asdict(FrameReport(0, 1.0, 100, {}, 10))
+    report = FrameReport(0, 1.0, 100, {}, 10)
+    assert np.isnan(report.psnr)
+    row = asdict(report)
     old_row = {name: value for name, value in row.items() if name != "psnr"}
     write_json(tmp_path / "report.json", {"frames": [row, {**old_row, "frame": 1}]})
+    assert read_json(tmp_path / "report.json")["frames"][0]["psnr"] is None
     reports = read_reports(tmp_path / "report.json", range(2))
     assert [np.isnan(read.psnr) for read in reports] == [True, True]
 
@@ -420,17 +489,19 @@ def refined_config():
     return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on"))
 
 
-def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path, monkeypatch):
+def test_stream_capture__stores_refined_cameras_and_resumes_with_them(
+    tmp_path_factory, monkeypatch
+):
     changes = np.full((2, 11), 1e-3)  # by features, of which the images have too few
     monkeypatch.setattr(
         "morgs_mi.extras.calibration.refine.RefinementProblem.matched", lambda _: (changes, 100)
     )
+    tmp_path = tmp_path_factory.mktemp("out")
     config = refined_config()
-    capture = load_capture(write_recording(tmp_path / "capture", 2), test_view=0)
-    out = tmp_path / "out"
-    stream_capture(capture, out, config)
-    stream = StreamReader(out / "stream.morgs")
-    whole = stream_of(out)
+    capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)
+    stream_capture(capture, tmp_path, config)
+    stream = StreamReader(tmp_path / "stream.morgs")
+    whole = stream_of(tmp_path)
     names = set(stream.metadata["distortions"])
     assert names == set(capture.names[1:]), "the terms of the training views"
     opened = open_stream_capture(stream, None, [0, 1])
@@ -438,14 +509,17 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path, 
     assert [list(view.distortion) for view in opened.views[1:]] == [
         *stream.metadata["distortions"].values()
     ]
-    changed = [
-        not np.array_equal(refined.viewmat, camera.viewmat)
-        for refined, camera in zip(stream.cameras, capture.cameras, strict=True)
-    ]
-    assert changed == [False, True, True], "the first one is held out"
-    (out / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
-    stream_capture(capture, out, config, resume=True)
-    assert stream_of(out) == whole
+    assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), (
+        "the held-out view"
+    )
+    assert all(
+        not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2)
+    )
+    first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
+    assert first["taken"]
+    (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
+    stream_capture(capture, tmp_path, config, resume=True)
+    assert stream_of(tmp_path) == whole
 
 
 @pytest.mark.parametrize("distortion", [[1, 2], {"cam1": ["x", "y"]}])

@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.layouts.colmap import read_colmap
+from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
 from morgs_mi.capture.points import match_capture
 from morgs_mi.cli.main import main
 from morgs_mi.extras.calibration.calibrate import (
@@ -32,6 +32,7 @@ from morgs_mi.io.video_writer import write_video
 from morgs_mi.testing import assert_close
 from tests.scenes import textured
 from tests.scenes.captures import write_timed_video
+from tests.scenes.full_disk import files_end_at
 
 
 def film(path, cameras, suffix=".mkv"):
@@ -104,6 +105,7 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path):
 @pytest.mark.parametrize(
     "names",
     [("a.JPG", "b.JPG", "c.JPG", "d.JPG"), (" a.tif", "b .webp", " c d .BMP", "e.TIFF")],
+    ids=["JPEG", "spaces and other formats"],
 )
 def test_calibrate__names_images_after_photos(tmp_path, names):
     planes = textured.textures()
@@ -113,6 +115,7 @@ def test_calibrate__names_images_after_photos(tmp_path, names):
         (tmp_path / name).write_bytes(
             cv2.imencode(Path(name).suffix.lower(), image, options)[1].tobytes()
         )
+        (tmp_path / f"._{name}").write_bytes(b"\0\5\x16\7")
     result = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
     assert {image.name for image in read_colmap(result.model).images} == set(names)
     assert load_capture(tmp_path).names == result.cameras
@@ -185,7 +188,7 @@ def test_check__of_a_camera_without_points_does_not_fit():
 
 
 @pytest.mark.slow
-def test_calibrate__names_a_camera_with_another_scene(tmp_path, capsys):
+def test_calibrate__names_a_camera_with_another_scene(tmp_path):
     film(tmp_path, textured.rig(6, 240, 180)[1:5])
     write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
     with pytest.raises(
@@ -199,13 +202,42 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path, capsys):
     ):
         calibrate(tmp_path, without=["cam7"])
     assert calibrate(tmp_path, without=["other"]).cameras == ("cam1", "cam2", "cam3", "cam4")
-    assert main(["calibrate", str(tmp_path), "--partial", "--overwrite"]) == 0
+    result = calibrate(tmp_path, CalibrateConfig(partial=True), overwrite=True)
+    assert (result.cameras, result.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
+    assert result.error < 0.5
+    assert load_capture(tmp_path).names == result.cameras
+
+
+@pytest.mark.slow
+def test_calibrate__prints_a_verdict_per_camera(tmp_path, capsys):
+    cameras = textured.rig(4, 240, 180)
+    film(tmp_path, cameras)
+    write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
+    assert main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
     printed = capsys.readouterr()
-    rows = dict(re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE))
-    assert re.match(r"\d{2,3} +0\.\d\d +fits", rows["cam1"])
+    rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
+    assert re.match(r"\d{3} +0\.\d\d +fits", rows["cam0"])
     assert re.match(r"0 +- +not checked", rows["other"])
     assert "other not checked: it could not be registered and has no pose" in printed.err
-    assert load_capture(tmp_path).names == ("cam1", "cam2", "cam3", "cam4")
+
+
+def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path, monkeypatch):
+    write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
+    model = pycolmap.Reconstruction(str(tmp_path / "found"))
+    clips = film(tmp_path / "clips", textured.rig(4))
+    checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
+    monkeypatch.setattr("morgs_mi.extras.calibration.calibrate.match_views", lambda *_: None)
+    monkeypatch.setattr(
+        "morgs_mi.extras.calibration.calibrate.map_views",
+        lambda *_: Candidate("incremental", model, checks),
+    )
+    size = (tmp_path / "found" / "points3D.txt").stat().st_size
+    with (
+        pytest.raises(OSError, match=r"cannot write .*sparse: "),
+        files_end_at(size - 1),
+    ):
+        calibrate(clips)
+    assert not (clips / "sparse").exists()
 
 
 def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path):

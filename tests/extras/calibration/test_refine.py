@@ -16,8 +16,10 @@ from morgs_mi.extras.calibration.refine import (
 )
 from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
 from morgs_mi.fit.view import rendered, withheld_blocks
+from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.runs.fit_capture import with_points
 from morgs_mi.testing import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic
@@ -46,9 +48,9 @@ def wrong_changes(count):
     return WRONG * np.random.default_rng(1).choice([-1, 1], (count, 11))
 
 
-def disturbed(cameras):
+def disturbed(cameras, scale=1.0):
     """Return cameras with wrong poses and focal lengths."""
-    return list(map(changed_camera, cameras, wrong_changes(len(cameras))))
+    return list(map(changed_camera, cameras, scale * wrong_changes(len(cameras))))
 
 
 def turn_error(cameras, true):
@@ -107,6 +109,21 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(
     monkeypatch.setattr("morgs_mi.extras.calibration.refine.withheld_blocks", with_an_empty_view)
     _, refinement = refine_cameras(splat_capture, LEAST)
     assert np.isfinite(refinement.calibrated_psnr)
+
+
+@pytest.mark.long
+def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_capture):
+    wrong = disturbed(textured_capture.cameras, 1.5)
+    disturbed_capture = textured_capture.with_cameras(wrong)
+    capture = with_points(disturbed_capture, 0, Progress())
+    how = ShortFitConfig(steps=200, width=160)
+    refined, refinement = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
+    assert refinement.taken
+    assert refinement.refined_psnr > refinement.calibrated_psnr + 0.5
+    true, start, result = (
+        [c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined)
+    )
+    assert turn_error(result, true) < 0.2 * turn_error(start, true)
 
 
 def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_capture, matched):

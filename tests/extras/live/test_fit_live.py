@@ -16,8 +16,10 @@ from morgs_mi.extras.live import sources as module
 from morgs_mi.extras.live.fit_live import fit_live
 from morgs_mi.extras.live.live_config import LiveConfig
 from morgs_mi.platform.bounded import read_json
+from morgs_mi.platform.png import png_bytes
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.fit_capture import stream_capture
+from tests.scenes.full_disk import files_end_at
 from tests.scenes.live_clip import (
     CONFIG,
     FPS,
@@ -214,6 +216,19 @@ def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path, cameras):
         in failed.value.__notes__[0]
     )
     assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()
+
+
+def test_fit_live__can_be_started_again_after_a_full_disk(tmp_path, rig, cameras):
+    sizes = [len(png_bytes(clip[0])) for clip in clips()]
+    assert (rig / "sparse" / "0" / "points3D.txt").stat().st_size > max(sizes)
+    live = LiveConfig(rig, timeout=BUSY, warm_up=0)
+    full = "check that its folder is writable and the disk has room"
+    # The calibration does not fit, then not even the images.
+    for limit in (max(sizes), min(sizes) - 1):
+        deliver(cameras, 0)
+        with pytest.raises(OSError, match=full), files_end_at(limit):
+            fit_live(range(4), tmp_path / "out", live, CONFIG)
+        assert not (tmp_path / "out").exists()
 
 
 def test_fit_live__does_not_replace_an_earlier_capture(tmp_path, rig):

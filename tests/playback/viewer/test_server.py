@@ -6,7 +6,10 @@ import html
 import json
 import os
 import re
+import signal
 import socket
+import subprocess
+import sys
 import webbrowser
 from concurrent.futures import ThreadPoolExecutor
 from threading import Lock, Thread
@@ -35,11 +38,15 @@ from morgs_mi.playback.viewer.images import RecordedImages
 from morgs_mi.playback.viewer.server import Viewer
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.render.rasterize import rasterize
+from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.playback.viewer.serving import decoded, exact, get, raw, viewing
 from tests.scenes import noise_capture
 from tests.scenes.changing_splats import rig, splats, write_stream
 from tests.scenes.gaussians import isotropic
 from tests.scenes.programs import run_script
+from tests.scenes.short_clip import FRAMES, short_clip
+
+CONNECTIONS = 200
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +93,12 @@ def test_refusal__accepts_the_viewers_own_page(host, origin):
             "got the host 'evil.example'",
         ),
         ({"host": "localhost.evil.example"}, "got the host 'localhost.evil.example'"),
+        ({"host": "user@localhost@evil.example"}, "got the host 'evil.example'"),
         ({"host": "localhost", "origin": "http://[evil"}, "expected a host and an origin"),
+        (
+            {"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},
+            "one of another page",
+        ),
         ({"host": "localhost", "sec-fetch-site": "same-site"}, "one of another page"),
     ],
 )
@@ -95,10 +107,23 @@ def test_refusal__names_a_foreign_page_or_host(headers, message):
 
 
 @pytest.mark.parametrize("path", ["/exact/0/color", "/nothing"])
-def test_viewer__refuses_rebound_names(url, path):
-    rebound = raw(url, f"GET {path} HTTP/1.1", "Host: evil.example")
+def test_viewer__refuses_other_pages_and_rebound_names(url, path):
+    port = url.rstrip("/").rpartition(":")[2]
+    foreign = raw(
+        url, f"GET {path} HTTP/1.1", f"Host: localhost:{port}", "Origin: https://evil.example"
+    )
+    rebound = raw(
+        url,
+        f"GET {path} HTTP/1.1",
+        f"Host: evil.example:{port}",
+        f"Origin: http://evil.example:{port}",
+    )
+    assert foreign.startswith("HTTP/1.1 403 ")
     assert rebound.startswith("HTTP/1.1 403 ")
     assert "got the host 'evil.example'" in rebound
+    assert raw(url, f"GET {path} HTTP/1.1").startswith(("HTTP/1.1 400 ", "HTTP/1.1 403 ")), (
+        "no host"
+    )
 
 
 @pytest.mark.parametrize(
@@ -106,16 +131,22 @@ def test_viewer__refuses_rebound_names(url, path):
     [
         "..%2fsecret",
         "%2e%2e/secret",
+        "stream.morgs/../../secret",
+        "stream.morgs%00",
         "recorded/0/..%2f..%2fsecret",
         "capture.json",
     ],
 )
 def test_viewer__serves_no_other_files(url, clip, path):
-    (clip[0].parent / "secret").write_text("Secret")
-    (clip[0] / "capture.json").write_text('{"capture": "Secret"}')
+    (clip[0].parent / "secret").write_text("secret")
+    (clip[0] / "secret").write_text("secret")
+    (clip[0] / "capture.json").write_text('{"capture": "secret"}')
     response, content = get(url, path)
     assert response.status in (400, 404)
-    assert b"Secret" not in content, "at most a sentence with the path itself"
+    assert b"secret" not in content or response.status == 400, (
+        "at most a sentence with the path itself"
+    )
+    assert b"root:" not in content
 
 
 def test_viewer__requires_the_token_where_other_machines_can_reach_it(clip):
@@ -126,11 +157,40 @@ def test_viewer__requires_the_token_where_other_machines_can_reach_it(clip):
         assert re.fullmatch(r"http://localhost:\d+", start)
         for path in ("", "stream.morgs"):
             assert get(url, path)[0].status == 200
-            for wrong in ("/", f"/{token[:-1]}/", f"/{token}x/", "/%FF/"):
+            for wrong in (
+                "/",
+                f"/{token[:-1]}/",
+                f"/{token}x/",
+                f"/{token.lower()}/",
+                "/%FF/",
+                f"/?token={token}/",
+            ):
                 response, content = get(start + wrong, path)
                 assert response.status == 403
                 assert b"expected the token" in content
         assert get(start + "/" + token)[0].status == 403
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [("GET / HTTP/1.1\x00",), ("\x16\x03\x01",), ("A" * 99999,)],
+)
+def test_viewer__survives_what_is_no_http(url, lines):
+    assert raw(url, *lines).startswith("HTTP/1.1 400 ")
+    assert get(url)[0].status == 200
+
+
+def test_viewer__answers_many_connections_at_once(url, clip):
+    idle = [
+        socket.create_connection(("127.0.0.1", int(url.rstrip("/").rpartition(":")[2])))
+        for _ in range(CONNECTIONS)
+    ]
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        answers = list(pool.map(lambda _: get(url, "stream.morgs")[1], range(CONNECTIONS)))
+    assert set(answers) == {(clip[0] / "stream.morgs").read_bytes()}
+    for connection in idle:
+        connection.close()
+    assert get(url)[0].status == 200
 
 
 def test_viewer__ends_connections_without_progress_and_beyond_a_limit(clip, monkeypatch):
@@ -169,13 +229,25 @@ def test_viewer__serves_regular_files_of_its_folder_alone(tmp_path, name, secret
         else:
             (folder / name).symlink_to(tmp_path / "secret")
         for path in ("stream.morgs", exact(0, "color", rig()[0]), "recorded/0/0"):
-            content = get(url, path)[1]
-            assert b"secret" not in content
-            assert secret is None or b"expected a file, got a link" in content
+            assert all(b"secret" not in get(url, path)[1] for _ in range(2))
         (folder / name).unlink()
         write_stream(folder / "stream.morgs")
         response, content = get(url, "stream.morgs")
         assert (response.status, content) == (200, (folder / "stream.morgs").read_bytes())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links")
+def test_viewer__names_a_stream_that_has_become_a_link_to_itself(tmp_path):
+    path = tmp_path / "stream.morgs"
+    write_stream(path)
+    with viewing(path) as url:
+        path.unlink()
+        path.symlink_to(path)
+        assert get(url)[0].status == 200
+        for part in ("stream.morgs", exact(0, "color", rig()[0]), "recorded/0/0"):
+            response, content = get(url, part)
+            assert response.status == 400
+            assert b"expected a file, got a link" in content
 
 
 @pytest.mark.parametrize("name", ["a\nb", "\udcff"])
@@ -186,6 +258,21 @@ def test_viewer__serves_streams_of_any_name(tmp_path, name):
         assert get(url, "stream.morgs")[1] == path.read_bytes()
         path.unlink()
         assert get(url, "stream.morgs")[0].status == 404
+
+
+def test_stream_response__ends_where_its_file_was_cut_off_meanwhile(clip, tmp_path, capfd):
+    path = tmp_path / "stream.morgs"
+    data = (clip[0] / "stream.morgs").read_bytes() + bytes(2**24)
+    path.write_bytes(data)
+    with viewing(path) as url:
+        with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=30) as connection:
+            connection.sendall(b"GET /stream.morgs HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            answer = connection.recv(2**16)
+            os.truncate(path, 2**20)
+            while not answer.endswith(b"\r\n0\r\n\r\n"):
+                answer += connection.recv(2**20)
+        assert len(answer) < len(data)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------
@@ -201,6 +288,7 @@ def test_viewer__serves_streams_of_any_name(tmp_path, name):
         ("bytes=999999999999999-", 416, slice(0)),
         ("bytes=20-10", 416, slice(0)),
         # Ignored: malformed, or more than one.
+        ("bytes=a-b", 200, slice(None)),
         ("bytes=-5", 200, slice(None)),
         ("bytes=0-1,3-4", 200, slice(None)),
         (f"bytes={'9' * 5000}-", 200, slice(None)),
@@ -221,7 +309,6 @@ def test_stream_response__continues_a_growing_file_and_restarts_with_a_replaced_
     with viewing(tmp_path) as url:
         response, content = get(url, "stream.morgs")
         tag = response.headers["ETag"]
-        assert "Content-Length" not in response.headers, "a fit may truncate the file meanwhile"
         with (tmp_path / "stream.morgs").open("ab") as file:
             file.write(complete[ends[2] : ends[3]])
         response, more = get(url, "stream.morgs", Range=f"bytes={len(content)}-", If_Range=tag)
@@ -340,6 +427,31 @@ def test_exact_images__render_one_at_a_time_and_the_newest_wins(url, monkeypatch
     assert sum(response.status == 204 for response, _ in answers) > len(cameras) // 2
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "forge", [damaged, with_forged_bytes, with_forged_packets, with_forged_header]
+)
+def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
+    path = tmp_path / "s"
+    camera = rig()[0]
+    wrong = []
+    for seed in range(6):
+        forged = forge(short_clip(), np.random.default_rng(seed))
+        path.write_bytes(forged)
+        try:
+            viewer = Viewer(open_stream(path))
+        except ValueError as error:
+            wrong += [] if str(error).startswith(f"{path}: ") else [str(error)]
+            continue
+        viewer.close()
+        for frame in range(FRAMES):
+            try:
+                viewer._exact._render(frame, "color", camera, 10.0)
+            except ValueError as error:
+                wrong += [] if str(error).startswith(f"{path}: ") else [str(error)]
+    assert not wrong
+
+
 @pytest.fixture
 def live(tmp_path):
     """Return a stream and its capture, which grow by a frame with each call of `add`, and the
@@ -366,6 +478,10 @@ def test_recorded_images__follow_a_live_fit_in_any_order(live):
     folder, add, images = live
     recorded = RecordedImages(None)
     assert_array_equal(recorded.at(open_stream(folder), 1, 0), images[0])
+    with pytest.raises(
+        ValueError, match="expected a camera and a frame of the stream, got 1 and 1"
+    ):
+        recorded.at(open_stream(folder), 1, 1)
     add(1)
     add(2)
     for view, frame in ((1, 2), (1, 2), (0, 0), (0, 1), (2, 1), (0, 2)):
@@ -384,9 +500,15 @@ def test_viewer__sends_recorded_images_as_jpeg(live):
         assert (response.status, response.headers["Content-Type"]) == (200, "image/jpeg")
         expected = decoded(cv2.imencode(".jpg", images[0][..., ::-1])[1].tobytes())
         assert_array_equal(decoded(content), expected)
-        response, content = get(url, "recorded/3/0")
-        assert response.status == 400
-        assert b"expected a camera and a frame of the stream" in content
+        for path in ("recorded/3/0", "recorded/0/1", "recorded/999999999/999999999"):
+            response, content = get(url, path)
+            assert response.status == 400
+            assert b"expected a camera and a frame of the stream" in content
+        # The frame is provisional as long as the stream has none.
+        stream = folder / "stream.morgs"
+        (folder / PROVISIONAL).write_bytes(stream.read_bytes())
+        stream.write_bytes(stream.read_bytes()[: open_stream(folder).index()[0][2]])
+        assert get(url, "recorded/1/0")[0].status == 200
 
 
 @pytest.mark.parametrize(
@@ -418,6 +540,14 @@ def test_viewer__names_a_capture_that_is_missing(clip, url, tmp_path):
     response, content = get(url, "recorded/0/0")
     assert response.status == 404
     assert b"if it has moved, name its folder with --capture" in content
+
+
+@pytest.mark.parametrize("capture", [5, "\0"])
+def test_viewer__starts_whatever_the_path_of_its_capture_is(tmp_path, capture):
+    write_stream(tmp_path / "stream.morgs", 1)
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": capture}))
+    with viewing(tmp_path) as url:
+        assert b'data-server="exact"' in get(url)[1]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -472,6 +602,27 @@ def test_view__refuses_a_port_that_is_taken(clip, capsys):
     assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(
         capsys.readouterr().err.split()
     )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_view__ends_on_ctrl_c(clip):
+    code = "import sys; from morgs_mi.cli.main import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "view", str(clip[0]), "--no-browser"]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell ignores SIGINT for the processes that it starts in the background.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as server:
+        link = next(line for line in server.stdout if "http://" in line)
+        assert get(link.split()[0], exact(0, "color", rig()[0]))[0].status == 200
+        server.send_signal(signal.SIGINT)
+        _, errors = server.communicate(timeout=60)
+    assert server.returncode == 130, errors
+    assert "Traceback" not in errors
 
 
 @pytest.mark.slow

@@ -29,7 +29,9 @@ def fits(check):
     [
         ("COLMAP", lambda V: FLIP @ V, "world to camera in OpenGL's"),
         ("COLMAP", np.linalg.inv, "camera to world in OpenCV's"),
+        ("COLMAP", lambda V: np.linalg.inv(FLIP @ V), "camera to world in OpenGL's"),
         ("Nerfstudio", lambda V: FLIP @ V, "camera to world in OpenCV's"),
+        ("Nerfstudio", lambda V: FLIP @ np.linalg.inv(V), "world to camera in OpenCV's"),
         ("Nerfstudio", lambda V: FLIP @ np.linalg.inv(FLIP @ V), "world to camera in OpenGL's"),
     ],
 )
@@ -50,6 +52,9 @@ def with_wrong_focal_length(camera):
 WRONG_CAMERAS = {
     "turned": lambda c: turned(c, 5),
     "upside down": lambda c: turned(c, 180),
+    "sideways": lambda c: turned(c, -90),
+    "other axes": lambda c: replace(c, viewmat=FLIP @ c.viewmat),
+    "inverse": lambda c: replace(c, viewmat=np.linalg.inv(c.viewmat)),
     "focal": with_wrong_focal_length,
 }
 
@@ -66,6 +71,15 @@ def test_check_rig__names_a_single_wrong_camera(capture, shared, kind):
     assert max(errors[:3] + errors[4:]) < 0.1, "only its own matches are bad"
 
 
+@pytest.mark.slow
+def test_check_rig__names_each_of_two_wrong_cameras(capture, shared):
+    changes = {1: WRONG_CAMERAS["upside down"], 4: WRONG_CAMERAS["focal"]}
+    check = check_rig(
+        with_cameras(capture, lambda i, c: changes[i](c) if i in changes else c), shared
+    )
+    assert fits(check) == [True, False, True, True, False, True]
+
+
 def test_check_rig__names_a_common_factor_on_all_focal_lengths(capture, shared):
     """Two views hardly determine a common focal length: the errors are below a pixel, but the right
     one has less.
@@ -77,10 +91,39 @@ def test_check_rig__names_a_common_factor_on_all_focal_lengths(capture, shared):
     assert "0.5 times the given value fits" in check.advice
 
 
+@pytest.mark.slow
+def test_check_rig__refuses_cameras_with_one_pose(capture, shared):
+    pose = capture.cameras[2].viewmat
+    one = check_rig(
+        with_cameras(capture, lambda i, c: replace(c, viewmat=pose) if i == 3 else c), shared
+    )
+    assert fits(one) == [True, True, True, False, True, True]
+    every = check_rig(with_poses(capture, lambda _: pose), shared)
+    assert not any(fits(every))
+
+
 def with_images(shared, capture, order):
     """Return the features as if camera i had recorded the images of camera order[i]."""
     features = [shared.features[k] for k in order]
     return match_views(features, capture.cameras)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("order", "wrong", "sentence"),
+    [
+        ((0, 3, 2, 1, 4, 5), {1, 3}, "clips of cam1 and cam3, or their poses, seem to be swapped"),
+        (
+            (0, 3, 1, 2, 4, 5),
+            {1, 2, 3},
+            "the poses of cam1, cam2, cam3 do not fit the images",  # two at a time explain nothing
+        ),
+    ],
+)
+def test_check_rig__names_images_in_another_order(capture, shared, order, wrong, sentence):
+    check = check_rig(capture, with_images(shared, capture, order))
+    assert {i for i, fit in enumerate(fits(check)) if fit is False} == wrong
+    assert sentence in check.advice
 
 
 @pytest.mark.parametrize("count", [2, 4])
@@ -90,6 +133,12 @@ def test_check_rig__names_swapped_images_in_a_small_rig(capture, shared, count):
     check = check_rig(part, with_images(shared, part, (1, 0, 2, 3)[:count]))
     assert check.fits is False
     assert "the clips of cam0 and cam1, or their poses, seem to be swapped" in check.advice
+
+
+@pytest.mark.slow
+def test_check_rig__refuses_a_copied_clip(capture, shared):
+    check = check_rig(capture, with_images(shared, capture, (0, 1, 2, 3, 3, 5)))
+    assert fits(check) == [True, True, True, True, False, True]
 
 
 @pytest.mark.slow
