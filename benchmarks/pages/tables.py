@@ -91,6 +91,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
             ("sets", needed.sets_table),
         )
     },
-    "starts": partial(study_table, starts, "starts", "starts_far"),
+    "starts": partial(study_table, starts, "starts", "starts_far", "starts_rooms"),
     "unseen": lambda: field.scenes_table(committed("random_scenes")["fits"]),
 }

@@ -33,9 +33,9 @@ class Column(NamedTuple):
     spread: bool = True
 
     def of(self, rows: Sequence[Mapping[str, Any]]) -> str:
-        """Return the figure of some rows."""
-        values = self.factor * np.array([row[self.score] for row in rows], float)
-        if self.spread:
+        """Return the figure of some rows, "-" where one has no such score."""
+        values = self.factor * np.array([row.get(self.score, np.nan) for row in rows], float)
+        if self.spread and np.isfinite(values).all():
             return plus_minus(values, self.decimals)
         return figure(float(values.mean()), self.decimals)
 

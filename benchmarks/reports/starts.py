@@ -5,17 +5,18 @@
 Mitsuba traces the scenes, and `fit_gaussians` gets the images with their sensors alone. The start
 "each view" gives it random points in every view, at 0.33 to 3 times the depth of the focus point.
 "random" starts from random points at the depths at which most views agree. So does "found", except
-on `room` and `hall`, where few cameras are far apart. Settings of this start were chosen on walk4
-and `room`, all others on `ring` and `dome`.
+on `room`, `hall` and the random rooms, where few cameras are far apart. Settings of this start were
+chosen on walk4 and `room`, all others on `ring` and `dome`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import tyro
@@ -25,12 +26,13 @@ from benchmarks.reports.study import Row, Scene, Study, StudyOptions
 from morgs_mi import Camera, StreamConfig, fit_gaussians, rasterize
 from morgs_mi.core.color_space import byte_values, encode_light
 from morgs_mi.core.rig import Focus
-from morgs_mi.core.view import View
+from morgs_mi.core.view import View, Views
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.initialise import seed_points
 
 COLUMNS = (
     Column("held out, dB", "psnr"),
+    Column("person, dB", "psnr_person"),
     Column("training views, dB", "train_psnr"),
 )
 STARTS = ("each view", "found")
@@ -39,6 +41,7 @@ _POINTS = 10_000
 _SAMPLES = 64
 _FOV = 40
 _WIDE = (160, 120)
+_TALL = (160, 208)
 _WHITE = {"type": "constant", "radiance": 0.8}
 _LAMP = {"type": "point", "position": [2, 5, 3], "intensity": {"type": "rgb", "value": 40}}
 
@@ -48,7 +51,7 @@ class Options(StudyOptions):
     """Scenes and output."""
 
     scenes: tuple[str, ...] = ("ring", "dome", "eight", "floor", "half dome", "room", "hall")
-    """Names of the scenes."""
+    """Names of the scenes; "room 3" is a random room of seed 3."""
     starts: tuple[str, ...] = STARTS
     """Starts that are compared."""
 
@@ -59,7 +62,10 @@ class Options(StudyOptions):
         return Study(
             measure,
             [
-                Scene({"scene": name, "start": start}, (scenes[name], start))
+                Scene(
+                    {"scene": name, "start": start},
+                    (scenes[name] if name in scenes else random_room(name), start),
+                )
                 for name, start in cells
             ],
             seeds=self.fit_seeds,
@@ -79,12 +85,14 @@ class Rig:
         eyes: positions of the sensors, which look at the origin.
         held_out: indices of the sensors that are scored.
         size: width and height of the images, px.
+        person: names of the objects that are a person.
     """
 
     objects: dict[str, Any]
     eyes: Sequence[Sequence[float]]
     held_out: Sequence[int]
     size: tuple[int, int]
+    person: Sequence[str] = ()
 
 
 def circle(count: int, height: float, distance: float, share: float = 1.0) -> list[list[float]]:
@@ -124,6 +132,38 @@ def room(bsdf: dict[str, Any]) -> dict[str, Any]:
     lamp = {**_LAMP, "position": [0.5, 3, 0.8], "intensity": {"type": "rgb", "value": 25}}
     walls = {"type": "cube", "to_world": place, "bsdf": {"type": "twosided", "bsdf": bsdf}}
     return {"walls": walls, "lamp": lamp}
+
+
+def random_room(name: str) -> Rig:
+    """Return a person between boxes in a room, with four cameras 55 to 95 degrees apart.
+
+    Args:
+        name: whose last word is the seed.
+    """
+    rng = np.random.default_rng(int(name.split()[-1]))
+
+    def surface(checks: int) -> dict[str, Any]:
+        return checkered(rng.uniform(0.1, 0.9, 3), rng.uniform(0.1, 0.9, 3), checks)
+
+    turn = mi.ScalarTransform4f().rotate([0, 1, 0], rng.uniform(0, 360))
+    parts = {
+        "legs": turn.translate([0, -0.3, 0]).scale([0.14, 0.3, 0.1]),
+        "body": turn.translate([0, 0.25, 0]).scale([0.2, 0.27, 0.12]),
+        "arms": turn.translate([0, 0.38, 0]).scale([0.45, 0.05, 0.06]),
+    }
+    person: dict[str, Any] = {
+        part: {"type": "cube", "to_world": place, "bsdf": surface(3)}
+        for part, place in parts.items()
+    }
+    person["head"] = shape("sphere", [0, 0.66, 0], 0.13, diffuse(*rng.uniform(0.2, 0.9, 3)))
+    boxes = {
+        f"box{k}": shape("cube", [np.sin(angle), -0.4, np.cos(angle)], 0.2, surface(2))
+        for k, angle in enumerate(rng.uniform(0, 2 * np.pi, 3))
+    }
+    angles = np.cumsum(np.radians(rng.uniform(55, 95, 4)))
+    eyes = [[3.2 * np.sin(a), rng.uniform(0.3, 1.2), 3.2 * np.cos(a)] for a in angles]
+    objects = person | boxes | {"floor": floor(surface(12), 5.0), **room(surface(6))}
+    return Rig(objects, eyes, [1], _TALL, (*person,))
 
 
 def rigs() -> dict[str, Rig]:
@@ -180,70 +220,73 @@ def rigs() -> dict[str, Rig]:
     }
 
 
-def traced(rig: Rig) -> tuple[list[Any], list[np.ndarray]]:
-    """Return the sensors of a rig and their images in linear light."""
+@dataclass(frozen=True, eq=False)
+class TracedView(View):
+    """A view of a rig, and its pixels [H, W] that show the person."""
+
+    person: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
+
+
+def traced(rig: Rig) -> Views[TracedView]:
+    """Return the views of a rig with their images in sRGB."""
     film = {"type": "hdrfilm", "width": rig.size[0], "height": rig.size[1]}
     film["rfilter"] = {"type": "box"}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, **rig.objects})
-    poses = [mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 1, 0]) for eye in rig.eyes]
-    sensors = [
-        mi.load_dict({"type": "perspective", "fov": _FOV, "to_world": pose, "film": film})
-        for pose in poses
-    ]
-    images = [
-        np.asarray(mi.render(scene, sensor=sensor, spp=_SAMPLES))[..., :3] for sensor in sensors
-    ]
-    return sensors, images
+    shapes = mi.load_dict({"type": "aov", "aovs": "shape:shape_index"})
+    bodies = [mi.ShapePtr(body) for body in scene.shapes() if body.id() in rig.person]
+    person = [dr.reinterpret_array(mi.UInt32, body)[0] for body in bodies]
+    views = []
+    for index, eye in enumerate(rig.eyes):
+        pose = mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 1, 0])
+        sensor = mi.load_dict({"type": "perspective", "fov": _FOV, "to_world": pose, "film": film})
+        light = np.asarray(mi.render(scene, sensor=sensor, spp=_SAMPLES))[..., :3]
+        shown = np.asarray(mi.render(scene, sensor=sensor, integrator=shapes, spp=1))[..., 0]
+        image = byte_values(encode_light(light))
+        held_out = index in rig.held_out
+        views.append(TracedView(Camera.of(sensor), image, None, held_out, np.isin(shown, person)))
+    return Views(views)
 
 
 def measure(rig: Rig, start: str, config: StreamConfig) -> dict[str, Any]:
     """Fit the images of a rig and return the scores of its views."""
-    sensors, lights = traced(rig)
-    images = [byte_values(encode_light(light)) for light in lights]
-    cameras = [Camera.of(sensor) for sensor in sensors]
-    train = [view for view in range(len(sensors)) if view not in rig.held_out]
-    points = ()
+    views = traced(rig)
     rng = np.random.default_rng(config.seed)
+    points = ()
     if start == "each view":
-        points = former_points([cameras[v] for v in train], [images[v] for v in train], rng)
+        points = former_points(views.train, rng)
     if start == "random":
-        points = seed_points([View(cameras[v], images[v]) for v in train], _POINTS, rng)
-    fitted = fit_gaussians(
-        [sensors[v] for v in train], [images[v] for v in train], *points, config=config
-    )
+        points = seed_points(views.train, _POINTS, rng)
+    images = [view.image for view in views.train]
+    fitted = fit_gaussians(views.train, images, *points, config=config)
 
-    def mean_psnr(views: Sequence[int]) -> float:
-        colors = [
-            np.asarray(rasterize(fitted.gaussians, cameras[v], config=fitted.render).color)
-            for v in views
-        ]
-        scores = [
-            psnr(np.clip(color, 0, 1), images[v] / 255.0)
-            for color, v in zip(colors, views, strict=True)
-        ]
+    def mean_psnr(views: Sequence[TracedView], *, is_of_person: bool = False) -> float:
+        scores = []
+        for view in views:
+            color = np.asarray(rasterize(fitted.gaussians, view.camera, config=fitted.render).color)
+            mask = view.person if is_of_person else None
+            scores.append(psnr(np.clip(color, 0, 1), view.image / 255.0, mask))
         return float(np.mean(scores))
 
     return {
-        "psnr": mean_psnr(rig.held_out),
-        "train_psnr": mean_psnr(train),
+        "psnr": mean_psnr(views.test),
+        **({"psnr_person": mean_psnr(views.test, is_of_person=True)} if rig.person else {}),
+        "train_psnr": mean_psnr(views.train),
         "num_gaussians": len(fitted.gaussians),
         "background": fitted.background,
     }
 
 
-def former_points(
-    cameras: Sequence[Camera], images: Sequence[np.ndarray], rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def former_points(views: Sequence[View], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return random points in every view, and their colours."""
     points = []
     colors = []
-    focus = Focus.of(cameras)
-    for camera, image in zip(cameras, images, strict=True):
-        pixels = rng.uniform(0, camera.size, (_POINTS // len(cameras), 2))
+    focus = Focus.of([view.camera for view in views])
+    for view in views:
+        pixels = rng.uniform(0, view.camera.size, (_POINTS // len(views), 2))
         columns, rows = pixels.astype(int).T
-        depths = focus.depth(camera) / rng.uniform(1 / 3, 3, len(pixels))
-        points.append(camera.unproject(pixels, depths))
-        colors.append(image[rows, columns] / 255)
+        depths = focus.depth(view.camera) / rng.uniform(1 / 3, 3, len(pixels))
+        points.append(view.camera.unproject(pixels, depths))
+        colors.append(view.image[rows, columns] / 255)
     return np.concatenate(points), np.concatenate(colors)
 
 
