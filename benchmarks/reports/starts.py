@@ -143,7 +143,8 @@ def random_room(name: str) -> Rig:
     rng = np.random.default_rng(int(name.split()[-1]))
 
     def surface(checks: int) -> dict[str, Any]:
-        return checkered(rng.uniform(0.1, 0.9, 3), rng.uniform(0.1, 0.9, 3), checks)
+        a, b = rng.uniform(0.1, 0.9, (2, 3)).tolist()
+        return checkered(a, b, checks)
 
     turn = mi.ScalarTransform4f().rotate([0, 1, 0], rng.uniform(0, 360))
     parts = {
@@ -234,7 +235,7 @@ def traced(rig: Rig) -> Views[TracedView]:
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, **rig.objects})
     shapes = mi.load_dict({"type": "aov", "aovs": "shape:shape_index"})
     bodies = [mi.ShapePtr(body) for body in scene.shapes() if body.id() in rig.person]
-    person = [dr.reinterpret_array(mi.UInt32, body)[0] for body in bodies]
+    person = [mi.UInt32(dr.reinterpret_array(mi.UInt32, body))[0] for body in bodies]
     views = []
     for index, eye in enumerate(rig.eyes):
         pose = mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 1, 0])
