@@ -347,7 +347,7 @@ class Gaussians:
             ValueError: one that all Gaussians have is missing, or as for `Gaussians`.
         """
         required = ("means", "log_scales", "quats", "logit_opacities", "sh_dc")
-        missing = sorted({*required} - parameters.keys())
+        missing = [name for name in required if name not in parameters]
         require(
             not missing,
             "Gaussians.from_parameters()",
