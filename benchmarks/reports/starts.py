@@ -234,6 +234,7 @@ def traced(rig: Rig) -> Views[TracedView]:
     film["rfilter"] = {"type": "box"}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, **rig.objects})
     shapes = mi.load_dict({"type": "aov", "aovs": "shape:shape_index"})
+    # The plugin `aov` numbers shapes by their place in Mitsuba's registry, not in the scene.
     bodies = [mi.ShapePtr(body) for body in scene.shapes() if body.id() in rig.person]
     person = [mi.UInt32(dr.reinterpret_array(mi.UInt32, body))[0] for body in bodies]
     views = []
