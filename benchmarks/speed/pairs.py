@@ -1,0 +1,196 @@
+"""Seconds of this checkout relative to those of another commit's, in pairs that run in turn.
+
+    python -m benchmarks.speed.pairs BASE --recordings SETS --json benchmarks/results/pairs.json
+
+BASE is a checkout of the commit to compare with. Each run is a process of its own. `floor`,
+`small` and `n3dv` are the later frames that `benchmarks.speed.host` counts. `first` is a step of
+the first frame and `splat` one of a user's loop with `rasterize` and `dr.backward`: with 3,000
+Gaussians at 96x72 (`floor`), 20,000 at 512x384 (`mid`) and 300 at 32x24 (`tiny`). The other cases
+fit recordings. *Memory* is the largest of a process, in MB.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+# Only what both checkouts have: this file runs with the package of either.
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.speed import frame_speed
+from benchmarks.speed.output import Output
+
+_SIZES = {
+    "tiny": frame_speed.Size(32, 24, 8, 300, 2),
+    "floor": frame_speed.Size(96, 72, 20, 3_000, 2),
+    "mid": frame_speed.Size(512, 384, 8, 20_000, 2),
+    **frame_speed.SIZES,
+}
+_LATER_FRAMES = 6
+_FEW_STEPS, _MANY_STEPS = 100, 500
+# Recordings and the numbers of their frames.
+_RECORDINGS = {"demo": 2, "basketball": 8}
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Checkouts and cases."""
+
+    base: tyro.conf.Positional[Path] = Path()
+    """Checkout of the commit to compare with."""
+    cases: tuple[str, ...] = (
+        *("later floor", "later small", "later n3dv", "first tiny", "first floor", "first mid"),
+        *("splat floor", "splat mid", "fit demo", "fit basketball"),
+    )
+    """Cases to run: what is measured, and the size or recording."""
+    pairs: int = 5
+    """Pairs of each case."""
+    recordings: Path = Path("recordings")
+    """Folder of the recordings demo and basketball."""
+
+
+def _later(name: str) -> dict[str, float]:
+    """Return the seconds of a later frame."""
+    size = _SIZES[name]
+    scene = frame_speed.Scene(size, 0)
+    images = scene.recorded(_LATER_FRAMES + 1, 0)
+    loop = frame_speed.loop_of(scene, frame_speed.default_config(size, 2), images[0])
+    seconds = [_seconds(partial(loop.push, views[1:])) for views in images[1:]]
+    return {f"later {name}": median(seconds[2:])}
+
+
+def _first(name: str) -> dict[str, float]:
+    """Return the seconds of a step of the first frame."""
+    import morgs_mi
+
+    size = _SIZES[name]
+    scene = frame_speed.Scene(size, 0)
+    cameras, images = scene.cameras()[1:9], scene.recorded(1, 0)[0][1:9]
+    points = np.asarray(scene.at(0).means)[::3]
+
+    def fit(steps: int) -> None:
+        settings = morgs_mi.FitConfig(
+            sh_degree=0, num_gaussians=size.gaussians, first_frame_steps=steps, exposure="off"
+        )
+        config = morgs_mi.StreamConfig(fit=settings)
+        morgs_mi.fit_gaussians(cameras, images, points, np.full(points.shape, 0.5), config)
+
+    return {f"first {name}": _per_step(fit)}
+
+
+def _splat(name: str) -> dict[str, float]:
+    """Return the seconds of a step of a user's loop over the cameras."""
+    import morgs_mi
+
+    scene = frame_speed.Scene(_SIZES[name], 0)
+    cameras, images = scene.cameras()[1:9], scene.recorded(1, 0)[0][1:9]
+    targets = [mi.TensorXf(image.astype(np.float32) / 255) for image in images]
+    start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
+    optimizer = mi.ad.Adam(lr=1e-3, params=start.parameters())
+
+    def fit(steps: int) -> None:
+        for step in range(steps):
+            gaussians = morgs_mi.Gaussians.from_parameters(optimizer)
+            color = morgs_mi.rasterize(gaussians, cameras[step % 8], ("color",)).color
+            dr.backward(dr.mean(dr.abs(color - targets[step % 8]), axis=None))
+            optimizer.step()
+
+    return {f"splat {name}": _per_step(fit)}
+
+
+def _fit(recording: str) -> dict[str, float]:
+    """Return the seconds of the first and of a later frame of a recording."""
+    frames = _RECORDINGS[Path(recording).name]
+    with tempfile.TemporaryDirectory() as folder:
+        command = ["morgs_mi", "fit", recording, folder + "/fit", "--frames", str(frames)]
+        subprocess.run([sys.executable, "-m", *command], check=True, stdout=subprocess.DEVNULL)
+        report = json.loads(Path(folder, "fit", "report.json").read_text())
+    first, *later = (frame["seconds"] for frame in report["frames"])
+    name = Path(recording).name
+    return {f"first frame of {name}": first, f"later frames of {name}": sum(later)}
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    dr.sync_thread()
+    start = time.perf_counter()
+    work()
+    dr.sync_thread()
+    return time.perf_counter() - start
+
+
+def _per_step(fit: Callable[[int], None]) -> float:
+    """Return the seconds of a step, from fits of few and of many steps."""
+    fit(_FEW_STEPS)
+    few, many = _seconds(partial(fit, _FEW_STEPS)), _seconds(partial(fit, _MANY_STEPS))
+    return (many - few) / (_MANY_STEPS - _FEW_STEPS)
+
+
+_MEASURES = {"later": _later, "first": _first, "splat": _splat, "fit": _fit}
+
+
+def _measured(measure: str, argument: str) -> dict[str, list[float]]:
+    """Return seconds, and the largest memory of this process and its children in MB, by name."""
+    mi.set_variant("llvm_ad_rgb")
+    seconds = _MEASURES[measure](argument)
+    users = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    memory = max(resource.getrusage(user).ru_maxrss for user in users) / 1024
+    return {name: [value, memory] for name, value in seconds.items()}
+
+
+def _run(checkout: Path, case: str, recordings: Path) -> dict[str, list[float]]:
+    """Return what a process with the package of a checkout measures."""
+    measure, name = case.split()
+    argument = str(recordings / name) if measure == "fit" else name
+    process = subprocess.run(
+        [sys.executable, __file__, "--measure", measure, argument],
+        env={**os.environ, "PYTHONPATH": str(checkout)},
+        check=True,
+        stdout=subprocess.PIPE,
+    )
+    return json.loads(process.stdout.splitlines()[-1])
+
+
+def main(options: Options) -> None:
+    """Run the pairs."""
+    trees = (options.base, Path(__file__).parents[2])
+    rows: dict[str, Any] = {}
+    for case in options.cases:
+        runs = [
+            [_run(tree, case, options.recordings) for tree in trees] for _ in range(options.pairs)
+        ]
+        for name in runs[0][0]:
+            # By pair, checkout and figure.
+            figures = np.array([[run[name] for run in pair] for pair in runs])
+            ratios = figures[:, 1, 0] / figures[:, 0, 0]
+            seconds, memory = np.median(figures, 0).T
+            rows[name] = {
+                "ratio": round(float(np.median(ratios)), 3),
+                "ratios": np.round(ratios, 3).tolist(),
+                "seconds": np.round(seconds, 5).tolist(),
+                "memory": np.round(memory).tolist(),
+            }
+            print(f"{name:30s}", rows[name], flush=True)
+    command = ["git", "-C", str(options.base), "rev-parse", "--short", "HEAD"]
+    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    options.write({"base": process.stdout.strip(), "pairs": rows}, unprinted=("pairs",))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--measure"]:
+        print(json.dumps(_measured(*sys.argv[2:])))
+    else:
+        main(tyro.cli(Options))
