@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.pages.results import committed
 from benchmarks.reports import far_cameras, field, held_out, needed, stability, starts
 from benchmarks.reports.plots import markdown
-from benchmarks.speed import host
+from benchmarks.speed import host, pairs
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -84,6 +84,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "host": lambda: host.sizes_table(committed("host")["sizes"]),
     "hard_fits": lambda: stability.fits_table(committed("stability")["rows"]),
     "extremes": lambda: stability.stability_table(committed("stability")["rows"]),
+    "pairs": lambda: pairs.pairs_table(committed("pairs")["pairs"]),
     **{
         f"trial_{name}": partial(trial_table, table)
         for name, table in (

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.reports.plots import markdown
 from benchmarks.speed import frame_speed
 from benchmarks.speed.output import Output
 
@@ -42,7 +43,7 @@ _SIZES = {
 }
 _LATER_FRAMES = 6
 _FEW_STEPS, _MANY_STEPS = 100, 500
-# Recordings and the numbers of their frames.
+# Recordings and the numbers of frames that are fitted.
 _RECORDINGS = {"demo": 2, "basketball": 8}
 
 
@@ -70,7 +71,7 @@ def _later(name: str) -> dict[str, float]:
     images = scene.recorded(_LATER_FRAMES + 1, 0)
     loop = frame_speed.loop_of(scene, frame_speed.default_config(size, 2), images[0])
     seconds = [_seconds(partial(loop.push, views[1:])) for views in images[1:]]
-    return {f"later {name}": median(seconds[2:])}
+    return {f"{name}, a later frame": median(seconds[2:])}
 
 
 def _first(name: str) -> dict[str, float]:
@@ -89,7 +90,7 @@ def _first(name: str) -> dict[str, float]:
         config = morgs_mi.StreamConfig(fit=settings)
         morgs_mi.fit_gaussians(cameras, images, points, np.full(points.shape, 0.5), config)
 
-    return {f"first {name}": _per_step(fit)}
+    return {f"{name}, a step of the first frame": _per_step(fit)}
 
 
 def _splat(name: str) -> dict[str, float]:
@@ -109,7 +110,7 @@ def _splat(name: str) -> dict[str, float]:
             dr.backward(dr.mean(dr.abs(color - targets[step % 8]), axis=None))
             optimizer.step()
 
-    return {f"splat {name}": _per_step(fit)}
+    return {f"{name}, a step of a user's loop": _per_step(fit)}
 
 
 def _fit(recording: str) -> dict[str, float]:
@@ -121,7 +122,7 @@ def _fit(recording: str) -> dict[str, float]:
         report = json.loads(Path(folder, "fit", "report.json").read_text())
     first, *later = (frame["seconds"] for frame in report["frames"])
     name = Path(recording).name
-    return {f"first frame of {name}": first, f"later frames of {name}": sum(later)}
+    return {f"{name}, first frame": first, f"{name}, later frames": sum(later)}
 
 
 def _seconds(work: Callable[[], Any]) -> float:
@@ -164,6 +165,20 @@ def _run(checkout: Path, case: str, recordings: Path) -> dict[str, list[float]]:
     return json.loads(process.stdout.splitlines()[-1])
 
 
+def pairs_table(rows: Mapping[str, Any]) -> str:
+    """Return the ratios of the pairs, and the medians of seconds and memory."""
+    lines = []
+    for name, row in rows.items():
+        ratios = sorted(row["ratios"])
+        medians = [f"{value:.2g}" for value in row["seconds"]]
+        memory = [f"{value:.0f}" for value in row["memory"]]
+        lines.append(
+            (name, f"{row['ratio']:.2f}", f"{ratios[0]:.2f} to {ratios[-1]:.2f}", *medians, *memory)
+        )
+    titles = "ratio", "of the pairs", "s before", "s now", "MB before", "MB now"
+    return markdown(("", *titles), lines)
+
+
 def main(options: Options) -> None:
     """Run the pairs."""
     trees = (options.base, Path(__file__).parents[2])
@@ -183,7 +198,7 @@ def main(options: Options) -> None:
                 "seconds": np.round(seconds, 5).tolist(),
                 "memory": np.round(memory).tolist(),
             }
-            print(f"{name:30s}", rows[name], flush=True)
+            print(f"{name:36s}", rows[name], flush=True)
     command = ["git", "-C", str(options.base), "rev-parse", "--short", "HEAD"]
     process = subprocess.run(command, check=True, capture_output=True, text=True)
     options.write({"base": process.stdout.strip(), "pairs": rows}, unprinted=("pairs",))
