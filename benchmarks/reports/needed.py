@@ -60,7 +60,7 @@ from morgs_mi.platform.files import write_json
 from morgs_mi.platform.progress import Progress
 from morgs_mi.playback.stream_header import truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
-from morgs_mi.runs.fit_capture import push_frame, with_points
+from morgs_mi.runs.fit_capture import push_frame, with_border, with_points
 
 RESULTS = Path(__file__).parents[1] / "results"
 PACKAGE = Path(morgs_mi.__file__).parent
@@ -237,9 +237,10 @@ class Opened:
     """A set with its images in memory, and the first frames of its default."""
 
     def __init__(self, recording: Recording, capture: Capture) -> None:
-        self.config = apply_values(StreamConfig(), recording.settings)
+        self.frames = [*capture.partial_frames(0, recording.frames)]
+        config = apply_values(StreamConfig(), recording.settings)
+        self.config = with_border(capture, self.frames[0], config)
         self.capture = with_points(capture, 0, Progress())
-        self.frames = [*self.capture.partial_frames(0, recording.frames)]
         self._first_frames: dict[int, tuple[StreamLoop, dict[str, Any]]] = {}
 
     def first_frame(self, seed: int) -> tuple[StreamLoop, dict[str, Any]]:
