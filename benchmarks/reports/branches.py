@@ -25,7 +25,7 @@ from morgs_mi.core.attributes import BY_NAME
 from morgs_mi.fit import initialise
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method import active_set, exposure, lift
+from morgs_mi.method import active_set, exposure, lift, motion
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.platform.config import apply_values
 
@@ -98,6 +98,7 @@ def groups() -> tuple[str, ...]:
 _RATES_AT = FitConfig.rates_at
 _LINE = exposure._line
 _RESPONSIBILITY = active_set.responsibility
+_STEP = motion._step
 _RESAMPLE = initialise.resample_points
 
 
@@ -107,6 +108,10 @@ def _everywhere(mask: np.ndarray) -> tuple[slice, slice] | None:
 
 def _any_motion(flows: Any, d: np.ndarray) -> np.ndarray:
     return np.any(np.linalg.norm(flows.project(d), axis=-1) > lift.NOISE_PX, axis=0)
+
+
+def _step_alone(jacobians: Any, sums: Any, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    return _STEP(jacobians, sums, near[:, :0], moves)
 
 
 _FREE_ROTATION = {**BY_NAME, "quats": replace(BY_NAME["quats"], gate="appearance")}
@@ -213,10 +218,8 @@ BRANCHES: tuple[Branch, ...] = (
     ),
     Branch(_ACTIVE, "Gaussians in some views only", {"method.active_set:QUIET": -1.0}),
     Branch(_ACTIVE, "core of a Gaussian", {"method.active_set:_CORE": 1.0}),
-    Branch(
-        _ACTIVE, "everything where most pixels changed", {"method.active_set:_MOST_CHANGED": 2.0}
-    ),
-    Branch(_ACTIVE, "least part of a changed block", {"method.active_set:_CHANGED": 0.0}),
+    Branch(_ACTIVE, "everything where most pixels changed", GONE),
+    Branch(_ACTIVE, "least part of a changed block", GONE),
     # method.flow, method.objective
     Branch(_FLOW, "flow guidance", {"motion.learn_motion": False}),
     Branch(_FLOW, "flow loss", {"fit.objective.flow_weight": 0.0}),
@@ -237,18 +240,14 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_LIFT, "variance of the flow", GONE),
     Branch(_LIFT, "prior of no motion", {"method.lift:_PRIOR_PIXELS": _LEAST}),
     Branch(_LIFT, "noise that grows with motion", {"method.lift:_NOISE_FRACTION": 0.0}),
-    Branch(_LIFT, "weight of hardly covered views", {"method.lift:_HALF_WEIGHT_PIXELS": _LEAST}),
+    Branch(_LIFT, "weight of hardly covered views", {"method.lift:HALF_WEIGHT_PIXELS": _LEAST}),
     Branch(_LIFT, "evidence of motion", {"method.lift:_evidence": _any_motion}),
     Branch(_LIFT, "soft confidence", GONE),
     Branch(_LIFT, "least motion", GONE),
     # method.motion, method.sweep
     Branch(_PROPOSALS, "proposals from neighbours", {"method.motion:_ROUNDS": 0}),
     Branch(_PROPOSALS, "proposals from the frame before", GONE),
-    Branch(
-        _PROPOSALS,
-        "clear gain of a proposal",
-        {"method.motion:_ERROR_RATIO": 1.0, "method.motion:_ERROR_RATIO_STATIC": 1.0},
-    ),
+    Branch(_PROPOSALS, "clear gain of a proposal", GONE),
     Branch(
         _PROPOSALS,
         "floors of the relative error",
@@ -262,15 +261,19 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_SEARCH, "further parts", {"method.search:_MAX_PARTS": 1}),
     Branch(_SEARCH, "reduced images", {"method.search:_reduction": lambda *_: 1}),
     # method.motion
-    Branch(_REFINE, "pixels of neighbours", {"method.motion:_NEAREST": 0}),
+    Branch(
+        _REFINE,
+        "pixels of neighbours",
+        {"method.motion:_step": _step_alone},
+    ),
     Branch(
         _REFINE,
         "start of the colour",
         {"method.motion:_color_change": lambda color, weight: np.zeros_like(color[0])},
     ),
-    Branch(_REFINE, "longest step", {"method.motion:LONGEST_PX": float(_ALL)}),
+    Branch(_REFINE, "longest step", GONE),
     Branch(_REFINE, "prior of no step", {"method.motion:_PRIOR_PIXELS": 1e-9}),
-    Branch(_REFINE, "colour of few pixels", {"method.motion:_HALF_COLOR_PIXELS": _LEAST}),
+    Branch(_REFINE, "colour of few pixels", {"method.motion:HALF_WEIGHT_PIXELS": _LEAST}),
     # method.residual, method.confidence, method.cohesion
     Branch(_CONFIDENCE, "confidence", {"motion.learn_confidence": False}),
     Branch(_CONFIDENCE, "two gates", {"motion.two_gates": False}),
@@ -290,7 +293,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_MASKS, "confidence of the first frame", {"fit.confidence_steps": 0}),
     Branch(_MASKS, "masks of later frames", {"fit.objective.mask_weight": 0.0}),
     Branch(_MASKS, "masks of objects", {"motion.mask_method": "none"}),
-    Branch(_MASKS, "threshold by the spread", {"motion.masks.threshold_mads": 0.0}),
+    Branch(_MASKS, "threshold by the spread", GONE),
     # method.residual, method.objective
     Branch(_OFFSET, "offset", {"motion.learn_offset": False}),
     Branch(_OFFSET, "offset loss", {"fit.objective.offset_weight": 0.0}),
@@ -351,18 +354,18 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_PLAN, "least number of Gaussians", {"fit.budget:LEAST_GAUSSIANS": 1}, True),
     Branch(_PLAN, "Gaussians that grow in the plan", {"fit.budget:_GROWING": 1.0}, True),
     # Constants of one meaning at one value.
-    Branch(_SHARED, "gain of a proposal that does not move", {"method.motion:_ERROR_RATIO": 0.8}),
-    Branch(_SHARED, "neighbours of cohesion", {"method.cohesion:_NEIGHBOURS": 8}),
+    Branch(_SHARED, "gain of a proposal that does not move", GONE),
+    Branch(_SHARED, "neighbours of cohesion", GONE),
     Branch(
         _SHARED,
         "quiet as hardly responsible",
         {"method.active_set:MIN_RESPONSIBILITY": active_set.QUIET},
     ),
-    Branch(_SHARED, "covered pixels of colour", {"method.motion:_HALF_COLOR_PIXELS": 1.0}),
+    Branch(_SHARED, "covered pixels of colour", GONE),
     Branch(_SHARED, "opacity of a birth", {"fit.density:_BIRTH_OPACITY": 0.3}),
     Branch(_SHARED, "overlap as half", {"method.active_set:_MIN_OVERLAP": active_set.EXPLAINED}),
     # Pixels that are a share of the image.
-    Branch(_SHARES, "longest step, a share", {"method.motion:LONGEST_PX": PerWidth(2.0)}),
+    Branch(_SHARES, "longest step, a share", GONE),
     Branch(
         _SHARES,
         "responsibility at most 1280 px wide",

@@ -9,8 +9,7 @@ which suffice to hold them in place. All other Gaussians are static splats.
 
 An object that appears in front of a static background hides a different part of it in each view,
 and no Gaussian is responsible. If active Gaussians cover less than half of a connected change, the
-Gaussians that lie in it by more than half are active. If more than half of all pixels changed, all
-Gaussians are active: leaving out the others would cost more than it saves.
+Gaussians that lie in it by more than half are active.
 
 Responsibility and overlap of a Gaussian: how much of its visible surface changed, and in how
 many of the views.
@@ -61,12 +60,6 @@ from morgs_mi.render.render_config import RenderConfig
 
 # Fraction of a connected change that active Gaussians must cover to explain it.
 EXPLAINED = 0.5
-# Fraction of a block's pixels above which it belongs to a connected change: fewer are noise, or the
-# rim of one.
-_CHANGED = 0.25
-# Fraction of all pixels above which all Gaussians are active: leaving out the others would cost
-# more than it saves.
-_MOST_CHANGED = 0.5
 # Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque
 # one. Its extent reaches the alpha cut-off at three and a third.
 _CORE = 0.6
@@ -286,8 +279,6 @@ def find_active_set(
     if not views:
         return ActiveSet(np.arange(0), len(gaussians), {}, 0)
     cameras = {v: view.camera for v, view in views.items()}
-    if sum(view.change.mean() for view in views.values()) > _MOST_CHANGED * len(views):
-        return full_active_set(gaussians, cameras, render)
     changed_views = ChangedViews.of(gaussians, [*views.values()], render)
     shares = responsibility(gaussians, changed_views)
     active = shares > MIN_RESPONSIBILITY
@@ -311,7 +302,7 @@ def _inside_unexplained(changed_views: ChangedViews, active: np.ndarray) -> np.n
     additions = np.zeros_like(active)
     covered = boxes.union(active)
     for v, counts in enumerate(changed_views.counts):
-        missing = _unexplained(counts, covered[v], boxes.grids[v].block)
+        missing = _unexplained(counts, covered[v])
         if missing.any():
             some = boxes.of_view(v)
             additions |= np.asarray(some.within(missing[None], some.sides) > 0.5 * some.area)
@@ -319,16 +310,15 @@ def _inside_unexplained(changed_views: ChangedViews, active: np.ndarray) -> np.n
     return additions
 
 
-def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:
+def _unexplained(counts: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """Return the blocks of the connected changes of a view that are covered by less than half, bool
     [rows, columns].
 
     Args:
         counts: number of changed pixels of each block.
         covered: the blocks that active Gaussians cover.
-        block: width and height of a block, px.
     """
-    changes = counts > _CHANGED * block[0] * block[1]
+    changes = counts > 0
     count, labels = cv2.connectedComponents(changes.astype(np.uint8))
     area = np.bincount(labels[changes], counts[changes], count)
     covered &= changes

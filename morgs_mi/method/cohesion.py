@@ -25,8 +25,8 @@ from scipy.spatial import KDTree
 from morgs_mi.core.gaussians import Gaussians
 
 # Number of nearest Gaussians: more of them would pull along thin objects of few Gaussians.
-_NEIGHBOURS = 12
-# lambda, the weight of an opaque neighbour against a Gaussian's own evidence: 12 of them outvote it
+NEIGHBOURS = 8
+# lambda, the weight of an opaque neighbour against a Gaussian's own evidence: 8 of them outvote it
 # by far.
 WEIGHT = 50.0
 # Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads
@@ -84,7 +84,7 @@ def share_confidence(
         still: logit of all others.
         neighbours: index of all means.
     """
-    near = neighbours.nearest(_NEIGHBOURS, indices)
+    near = neighbours.nearest(NEIGHBOURS, indices)
     if not near.size:
         return logit
     affinity = np.float32(WEIGHT) * np.asarray(gaussians.opacities)[near]

@@ -21,36 +21,15 @@ def motion_floor(width: int, config: MaskConfig) -> float:
     return max(config.floor * width / _FLOOR_WIDTH, NOISE_PX)
 
 
-def flow_threshold(motion: np.ndarray, reliable: np.ndarray, config: MaskConfig) -> float:
-    """Return the speed in pixels above which a pixel moves: max(floor, median + 4 MAD) of the
-    speeds.
-
-    The median assumes that less than half of the image moves. Only reliable pixels count.
-
-    Args:
-        motion: [H, W, 2] in pixels, of either sign.
-        reliable: [H, W] bool.
-        config: settings of the threshold.
-    """
-    speed = np.linalg.norm(motion, axis=-1)
-    speed = speed[reliable] if reliable.any() else speed.ravel()
-    median = np.median(speed)
-    spread = np.median(np.abs(speed - median))
-    return float(
-        max(motion_floor(motion.shape[1], config), median + config.threshold_mads * spread)
-    )
-
-
 def flow_mask(motion: np.ndarray, reliable: np.ndarray, config: MaskConfig) -> np.ndarray:
-    """Return the mask of moving pixels [H, W] bool: the motion exceeds its `flow_threshold`
-    (eq. 9).
+    """Return the mask of moving pixels [H, W] bool: the motion exceeds its `motion_floor` (eq. 9).
 
     Args:
         motion: [H, W, 2] in pixels, of either sign.
         reliable: [H, W] bool; unreliable pixels are not in the mask.
         config: settings of the threshold.
     """
-    return (np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)) & reliable
+    return (np.linalg.norm(motion, axis=-1) > motion_floor(motion.shape[1], config)) & reliable
 
 
 def motion_mask(

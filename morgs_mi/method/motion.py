@@ -12,7 +12,7 @@ W_iv there (see `error_per_gaussian`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
-A Gaussian accepts a proposal that clearly lowers its error. Only the surroundings of Gaussians that
+A Gaussian accepts a proposal that lowers its error. Only the surroundings of Gaussians that
 may move are rendered.
 
 **Refinement** of displacement and colour in closed form, from the key views' images; beyond the
@@ -32,7 +32,7 @@ views v are
 A Gaussian accepts the step if its error falls. Then its colour changes by the mean error of its
 pixels,
 
-    c = sum_v sum_x w e / (sum_v sum_x w + 10 px) .
+    c = sum_v sum_x w e / (sum_v sum_x w + 1 px) .
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.types import Arrays
 from morgs_mi.method.active_set import ActiveSet
-from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
-from morgs_mi.method.lift import LOGIT, lift_flow
+from morgs_mi.method.cohesion import NEIGHBOURS, NeighbourIndex, share_confidence
+from morgs_mi.method.lift import HALF_WEIGHT_PIXELS, LOGIT, lift_flow
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
 from morgs_mi.method.observed_view import ObservedView
@@ -56,23 +56,8 @@ from morgs_mi.method.sweep import relative_error
 
 # Rounds of proposals: in two, a motion reaches neighbours of neighbours.
 _ROUNDS = 2
-# Nearest Gaussians that a proposal is drawn from.
-_NEIGHBOURS = 8
-# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves
-# otherwise and if not. Others move at the same time: a smaller gain is chance.
-_ERROR_RATIO = 0.9
-_ERROR_RATIO_STATIC = 0.8
-# Nearest Gaussians whose pixels count in a refinement, too, if they move: a small Gaussian alone
-# may cover one straight edge.
-_NEAREST = 8
 # Weight of the prior that this step is 0, in pixels on which the contrast is 1 per px.
 _PRIOR_PIXELS = 1e-3
-# Longest step of a refinement, in px of the view where it is longest: farther away, the image is
-# not linear.
-LONGEST_PX = 2.0
-# Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is
-# noise.
-_HALF_COLOR_PIXELS = 10.0
 
 
 def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
@@ -88,7 +73,8 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
     start_sums = problem.sums_at(d)
     if not moves.any():
         return replace(start, color_change=_color_change(start_sums["color"], start_sums["weight"]))
-    near = problem.neighbours.nearest(_NEAREST)
+    # Their pixels count as well: a small Gaussian alone may cover one straight edge.
+    near = problem.neighbours.nearest(NEIGHBOURS)
     places = np.asarray(problem.gaussians.means) + d
     cameras = [view.camera for view in problem.views.values()]
     jacobians = np.stack([camera.projection_jacobian(places) for camera in cameras])
@@ -110,12 +96,12 @@ def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the change c [N, 3] of the constant SH coefficients from the sums of e [V, N, 3] and
     of 1 [V, N].
     """
-    return color.sum(0) / (weight.sum(0)[:, None] + _HALF_COLOR_PIXELS) / np.float32(SH_C0)
+    return color.sum(0) / (weight.sum(0)[:, None] + HALF_WEIGHT_PIXELS) / np.float32(SH_C0)
 
 
 def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums G [V, N, 3] (xx, xy, yy) and b
-    [V, N, 2], shortened to `LONGEST_PX` in the view where it is longest.
+    [V, N, 2].
     """
     G = sums["normal"][..., [0, 1, 1, 2]].reshape(*sums["normal"].shape[:2], 2, 2)
     system = np.einsum("vnia,vnij,vnjb->nab", jacobians, G, jacobians, optimize=True)
@@ -125,9 +111,7 @@ def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarr
     right = right + np.einsum("nk,nka->na", counts, right[near])
     # lambda, which has the unit of J' J.
     prior = max(_PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1)), 1e-30)
-    step = np.linalg.solve(system + prior * np.eye(3), right[..., None])[..., 0]
-    length = np.linalg.norm(np.einsum("vnij,nj->vni", jacobians, step), axis=-1).max(axis=0)
-    return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]
+    return np.linalg.solve(system + prior * np.eye(3), right[..., None])[..., 0]
 
 
 def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
@@ -139,7 +123,7 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """
     d = start.displacement  # [N, 3]
     logit = start.logit_confidence
-    near = problem.neighbours.nearest(_NEIGHBOURS)
+    near = problem.neighbours.nearest(NEIGHBOURS)
     if not (d.any() and near.size):
         return start
     reached = np.asarray(d.any(axis=1))
@@ -159,8 +143,7 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         if not differs.any():
             continue
         new_error = relative_error(images.sums(displaced(problem.gaussians, proposal), names))
-        ratio = np.where(moves, _ERROR_RATIO, _ERROR_RATIO_STATIC)
-        is_better = differs & (new_error < ratio * error)
+        is_better = differs & (new_error < error)
         d = np.where(is_better[:, None], proposal, d)
         error = np.where(is_better, new_error, error)
         moving = np.maximum(logit, SOFT_LOGIT)

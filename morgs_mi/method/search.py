@@ -30,7 +30,7 @@ from scipy.sparse.csgraph import connected_components
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import displaced
-from morgs_mi.method.cohesion import NeighbourIndex
+from morgs_mi.method.cohesion import NEIGHBOURS, NeighbourIndex
 from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
 
 # Steps of the grid from 0 to its end, in each direction of each axis: it has 36,000 places.
@@ -40,9 +40,7 @@ _COLORS = 3
 # Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above
 # which it is not explained.
 _UNEXPLAINED = 3.0
-# Nearest Gaussians that it forms a part with if they are not explained either, and the fewest
-# Gaussians of a part.
-_NEIGHBOURS = 8
+# The fewest Gaussians of a part.
 _MIN_SIZE = 4
 # Cost of a displacement, relative to no displacement, up to which it is tested.
 _COST_RATIO = 0.3
@@ -108,7 +106,7 @@ def _unexplained_parts(
     unexplained = visible & (error > _UNEXPLAINED * typical)
     if np.count_nonzero(unexplained) < _MIN_SIZE:
         return []
-    near = NeighbourIndex(np.asarray(problem.gaussians.means) + displacement).nearest(_NEIGHBOURS)
+    near = NeighbourIndex(np.asarray(problem.gaussians.means) + displacement).nearest(NEIGHBOURS)
     ends = unexplained[:, None] & unexplained[near]
     rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))

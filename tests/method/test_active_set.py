@@ -138,13 +138,6 @@ def test_find_active_set__keeps_what_moved_for_one_more_frame(previous):
     assert found(previous_gaussians, nothing).indices.tolist() == [7]
 
 
-def test_find_active_set__takes_everything_where_most_pixels_changed(previous):
-    half = np.zeros((96, 128), bool)
-    half[:60] = True
-    active = found(previous, dict.fromkeys(range(V), half))
-    assert active.fractions == {"gaussians": 1, "views": 1, "pixels": 1}
-
-
 @pytest.mark.parametrize("grows", [False, True])
 def test_fit_later_frame__with_the_active_set_equals_the_full_fit(previous, current, grows):
     """Error of the moved image, and the survivors: static Gaussians are unchanged to the bit."""

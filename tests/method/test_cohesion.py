@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from morgs_mi.method.cohesion import NeighbourIndex, share_confidence
+from morgs_mi.method.cohesion import NEIGHBOURS, NeighbourIndex, share_confidence
 from tests.scenes.gaussians import isotropic, random_sheet
 
 STILL = -2.0
@@ -53,7 +53,7 @@ def test_share_confidence__solves_its_equation(monkeypatch):
     assert_allclose(few, many, atol=1e-5)
     means = np.asarray(gaussians.means)
     i = 650
-    near = np.argsort(np.linalg.norm(means - means[i], axis=1))[1:13]
+    near = np.argsort(np.linalg.norm(means - means[i], axis=1))[1 : NEIGHBOURS + 1]
     affinity = 0.2 * 0.9  # of an opaque neighbour
     expected = (moving(0.5)[i] + affinity * many[near].sum()) / (1 + affinity * len(near))
     assert_allclose(many[i], expected, atol=1e-4)

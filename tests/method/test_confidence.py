@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from morgs_mi.evaluate.metrics import iou
-from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor
+from morgs_mi.method.confidence import flow_mask, motion_floor
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskConfig
@@ -46,18 +46,19 @@ def test_observe_key_views__masks_follow_their_settings():
     assert observed(image, previous).mask is None
 
 
-def test_flow_threshold__follows_width_and_noise():
+def test_motion_floor__follows_the_width():
     for width, threshold in ((1352, 0.5), (2704, 1.0), (160, 0.2)):
-        motion = np.zeros((4, width, 2))
-        assert flow_threshold(motion, motion[..., 0] == 0, CONFIG) == threshold
+        assert motion_floor(width, CONFIG) == threshold
     assert motion_floor(676, MaskConfig(floor=0.8)) == pytest.approx(0.4, rel=1e-12)
-    noisy = np.random.default_rng(0).normal(0, 1, (100, 100, 2))
-    for mads in (4, 2):
-        threshold = flow_threshold(
-            noisy, np.ones((100, 100), bool), MaskConfig(threshold_mads=mads)
-        )
-        # Rayleigh: median 1.18, MAD 0.45; 1 % of it lies above 3.
-        assert threshold == pytest.approx(1.18 + mads * 0.45, rel=0.05)
+
+
+def test_flow_mask__has_the_reliable_pixels_above_the_floor():
+    motion = np.zeros((1, 1352, 2))
+    motion[0, :3, 0] = 0.49, 0.51, -0.51
+    reliable = np.ones((1, 1352), bool)
+    assert np.flatnonzero(flow_mask(motion, reliable, CONFIG)).tolist() == [1, 2]
+    reliable[0, 1] = False
+    assert np.flatnonzero(flow_mask(motion, reliable, CONFIG)).tolist() == [2]
 
 
 def test_flow_mask__excludes_unreliable_pixels():

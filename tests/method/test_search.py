@@ -85,7 +85,7 @@ def test_search_motion__keeps_a_part_that_vanished(scene):
     ("threshold", "value"),
     [
         ("_UNEXPLAINED", 1e3),
-        ("_NEIGHBOURS", 1),  # the rod is a row of pairs
+        ("NEIGHBOURS", 1),  # the rod is a row of pairs
         ("_MIN_SIZE", ROD + 1),
         ("_COST_RATIO", 0.0),
         ("_ERROR_RATIO", 0.0),

@@ -26,11 +26,9 @@ class MaskConfig:
         ValueError: a number is out of range.
     """
 
-    threshold_mads: NonNegative = 4.0
-    """Speed above which a pixel moves: this many median absolute deviations above the median."""
     floor: NonNegative = 0.5
-    """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
-    proportional to the width, as the motion of a scene is."""
+    """Speed above which a pixel moves, in pixels in an image of 1352 px width, N3DV's half
+    resolution; it is proportional to the width, as the motion of a scene is."""
     prompts: Count = 16
     """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
     of the decoder; the smaller ones stay as they are in the flow mask."""
