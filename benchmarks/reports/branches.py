@@ -240,14 +240,18 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_LIFT, "variance of the flow", GONE),
     Branch(_LIFT, "prior of no motion", {"method.lift:_PRIOR_PIXELS": _LEAST}),
     Branch(_LIFT, "noise that grows with motion", {"method.lift:_NOISE_FRACTION": 0.0}),
-    Branch(_LIFT, "weight of hardly covered views", {"method.lift:HALF_WEIGHT_PIXELS": _LEAST}),
+    Branch(_LIFT, "weight of hardly covered views", {"method.lift:_HALF_WEIGHT_PIXELS": _LEAST}),
     Branch(_LIFT, "evidence of motion", {"method.lift:_evidence": _any_motion}),
     Branch(_LIFT, "soft confidence", GONE),
     Branch(_LIFT, "least motion", GONE),
     # method.motion, method.sweep
     Branch(_PROPOSALS, "proposals from neighbours", {"method.motion:_ROUNDS": 0}),
     Branch(_PROPOSALS, "proposals from the frame before", GONE),
-    Branch(_PROPOSALS, "clear gain of a proposal", GONE),
+    Branch(
+        _PROPOSALS,
+        "clear gain of a proposal",
+        {"method.motion:_ERROR_RATIO": 1.0, "method.motion:_ERROR_RATIO_STATIC": 1.0},
+    ),
     Branch(
         _PROPOSALS,
         "floors of the relative error",
@@ -273,7 +277,7 @@ BRANCHES: tuple[Branch, ...] = (
     ),
     Branch(_REFINE, "longest step", GONE),
     Branch(_REFINE, "prior of no step", {"method.motion:_PRIOR_PIXELS": 1e-9}),
-    Branch(_REFINE, "colour of few pixels", {"method.motion:HALF_WEIGHT_PIXELS": _LEAST}),
+    Branch(_REFINE, "colour of few pixels", {"method.motion:_HALF_COLOR_PIXELS": _LEAST}),
     # method.residual, method.confidence, method.cohesion
     Branch(_CONFIDENCE, "confidence", {"motion.learn_confidence": False}),
     Branch(_CONFIDENCE, "two gates", {"motion.two_gates": False}),
@@ -354,14 +358,14 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_PLAN, "least number of Gaussians", {"fit.budget:LEAST_GAUSSIANS": 1}, True),
     Branch(_PLAN, "Gaussians that grow in the plan", {"fit.budget:_GROWING": 1.0}, True),
     # Constants of one meaning at one value.
-    Branch(_SHARED, "gain of a proposal that does not move", GONE),
+    Branch(_SHARED, "gain of a proposal that does not move", {"method.motion:_ERROR_RATIO": 0.8}),
     Branch(_SHARED, "neighbours of cohesion", GONE),
     Branch(
         _SHARED,
         "quiet as hardly responsible",
         {"method.active_set:MIN_RESPONSIBILITY": active_set.QUIET},
     ),
-    Branch(_SHARED, "covered pixels of colour", GONE),
+    Branch(_SHARED, "covered pixels of colour", {"method.motion:_HALF_COLOR_PIXELS": 1.0}),
     Branch(_SHARED, "opacity of a birth", {"fit.density:_BIRTH_OPACITY": 0.3}),
     Branch(_SHARED, "overlap as half", {"method.active_set:_MIN_OVERLAP": active_set.EXPLAINED}),
     # Pixels that are a share of the image.

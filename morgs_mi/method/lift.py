@@ -50,8 +50,8 @@ _PRIOR_PIXELS = 0.3
 _NOISE_FRACTION = 0.2
 # Rounds of reweighting; more change little.
 _ROUNDS = 4
-# Covered pixels at which the evidence of a view counts half: of few pixels, it is noise.
-HALF_WEIGHT_PIXELS = 1.0
+# Covered pixels at which a view's evidence counts half.
+_HALF_WEIGHT_PIXELS = 1.0
 # Evidence e_i above which a Gaussian moves.
 _MIN_EVIDENCE = 0.5
 LOGIT = 2.0
@@ -124,7 +124,7 @@ def lift_flow(gaussians: Gaussians, flows: Sequence[ViewFlow]) -> MotionStart:
 def _evidence(flows: _Flows, d: np.ndarray) -> np.ndarray:
     """Return the evidence e [N]: how much better d [N, 3] explains the flow than no motion does."""
     motion = flows.project(d)
-    a = flows.weight / (flows.weight + HALF_WEIGHT_PIXELS)
+    a = flows.weight / (flows.weight + _HALF_WEIGHT_PIXELS)
     gain = flows.cost(np.zeros_like(d), motion) - flows.cost(d, motion)
     return (a * gain).sum(axis=0) / a.sum(axis=0, initial=1e-6)
 

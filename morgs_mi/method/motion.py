@@ -12,7 +12,7 @@ W_iv there (see `error_per_gaussian`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
-A Gaussian accepts a proposal that lowers its error. Only the surroundings of Gaussians that
+A Gaussian accepts a proposal that clearly lowers its error. Only the surroundings of Gaussians that
 may move are rendered.
 
 **Refinement** of displacement and colour in closed form, from the key views' images; beyond the
@@ -32,7 +32,7 @@ views v are
 A Gaussian accepts the step if its error falls. Then its colour changes by the mean error of its
 pixels,
 
-    c = sum_v sum_x w e / (sum_v sum_x w + 1 px) .
+    c = sum_v sum_x w e / (sum_v sum_x w + 10 px) .
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.types import Arrays
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import NEIGHBOURS, NeighbourIndex, share_confidence
-from morgs_mi.method.lift import HALF_WEIGHT_PIXELS, LOGIT, lift_flow
+from morgs_mi.method.lift import LOGIT, lift_flow
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
 from morgs_mi.method.observed_view import ObservedView
@@ -56,8 +56,15 @@ from morgs_mi.method.sweep import relative_error
 
 # Rounds of proposals: in two, a motion reaches neighbours of neighbours.
 _ROUNDS = 2
+# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves
+# otherwise and if not. Others move at the same time: a smaller gain is chance.
+_ERROR_RATIO = 0.9
+_ERROR_RATIO_STATIC = 0.8
 # Weight of the prior that this step is 0, in pixels on which the contrast is 1 per px.
 _PRIOR_PIXELS = 1e-3
+# Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is
+# noise.
+_HALF_COLOR_PIXELS = 10.0
 
 
 def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
@@ -96,7 +103,7 @@ def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the change c [N, 3] of the constant SH coefficients from the sums of e [V, N, 3] and
     of 1 [V, N].
     """
-    return color.sum(0) / (weight.sum(0)[:, None] + HALF_WEIGHT_PIXELS) / np.float32(SH_C0)
+    return color.sum(0) / (weight.sum(0)[:, None] + _HALF_COLOR_PIXELS) / np.float32(SH_C0)
 
 
 def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
@@ -143,7 +150,8 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         if not differs.any():
             continue
         new_error = relative_error(images.sums(displaced(problem.gaussians, proposal), names))
-        is_better = differs & (new_error < error)
+        ratio = np.where(moves, _ERROR_RATIO, _ERROR_RATIO_STATIC)
+        is_better = differs & (new_error < ratio * error)
         d = np.where(is_better[:, None], proposal, d)
         error = np.where(is_better, new_error, error)
         moving = np.maximum(logit, SOFT_LOGIT)
