@@ -42,7 +42,8 @@ _SIZES = {
     **frame_speed.SIZES,
 }
 _LATER_FRAMES = 6
-_FEW_STEPS, _MANY_STEPS = 100, 500
+_FEW_STEPS = 100
+_MANY_STEPS = 500
 # Recordings and the numbers of frames that are fitted.
 _RECORDINGS = {"demo": 2, "basketball": 8}
 
@@ -80,7 +81,8 @@ def _first(name: str) -> dict[str, float]:
 
     size = _SIZES[name]
     scene = frame_speed.Scene(size, 0)
-    cameras, images = scene.cameras()[1:9], scene.recorded(1, 0)[0][1:9]
+    cameras = scene.cameras()[1:9]
+    images = scene.recorded(1, 0)[0][1:9]
     points = np.asarray(scene.at(0).means)[::3]
 
     def fit(steps: int) -> None:
@@ -98,8 +100,9 @@ def _splat(name: str) -> dict[str, float]:
     import morgs_mi
 
     scene = frame_speed.Scene(_SIZES[name], 0)
-    cameras, images = scene.cameras()[1:9], scene.recorded(1, 0)[0][1:9]
-    targets = [mi.TensorXf(image.astype(np.float32) / 255) for image in images]
+    cameras = scene.cameras()[1:9]
+    images = scene.recorded(1, 0)[0][1:9]
+    targets = [_target(image) for image in images]
     start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
     optimizer = mi.ad.Adam(lr=1e-3, params=start.parameters())
 
@@ -111,6 +114,10 @@ def _splat(name: str) -> dict[str, float]:
             optimizer.step()
 
     return {f"{name}, a step of a user's loop": _per_step(fit)}
+
+
+def _target(image: Any) -> Any:
+    return mi.TensorXf(image.astype(np.float32) / 255)
 
 
 def _fit(recording: str) -> dict[str, float]:
@@ -136,8 +143,9 @@ def _seconds(work: Callable[[], Any]) -> float:
 def _per_step(fit: Callable[[int], None]) -> float:
     """Return the seconds of a step, from fits of few and of many steps."""
     fit(_FEW_STEPS)
-    few, many = _seconds(partial(fit, _FEW_STEPS)), _seconds(partial(fit, _MANY_STEPS))
-    return (many - few) / (_MANY_STEPS - _FEW_STEPS)
+    few_seconds = _seconds(partial(fit, _FEW_STEPS))
+    many_seconds = _seconds(partial(fit, _MANY_STEPS))
+    return (many_seconds - few_seconds) / (_MANY_STEPS - _FEW_STEPS)
 
 
 _MEASURES = {"later": _later, "first": _first, "splat": _splat, "fit": _fit}

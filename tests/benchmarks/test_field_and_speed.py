@@ -52,6 +52,16 @@ def test_host__counts_the_operations_of_a_frame_and_of_a_step(tmp_path):
 
 
 @pytest.mark.slow
+def test_pairs__of_a_checkout_with_itself_have_seconds_and_memory(tmp_path):
+    command = ["-m", "benchmarks.speed.pairs", ".", "--pairs", "2", "--cases", "splat tiny"]
+    out = tmp_path / "pairs.json"
+    subprocess.run([sys.executable, *command, "--json", str(out)], cwd=ROOT, check=True)
+    (row,) = read_json(out)["pairs"].values()
+    assert len(row["ratios"]) == 2
+    assert min(*row["ratios"], *row["seconds"], *row["memory"]) > 0
+
+
+@pytest.mark.slow
 def test_pictures__are_drawn():
     loop = StreamLoop.of(recording(), CONFIG)
     frames = recording().partial_frames(0, CONFIG.motion.mask_interval + 1)
