@@ -275,7 +275,7 @@ BRANCHES: tuple[Branch, ...] = (
         "start of the colour",
         {"method.motion:_color_change": lambda color, weight: np.zeros_like(color[0])},
     ),
-    Branch(_REFINE, "longest step", GONE),
+    Branch(_REFINE, "longest step", {"method.motion:LONGEST_PX": float(_ALL)}),
     Branch(_REFINE, "prior of no step", {"method.motion:_PRIOR_PIXELS": 1e-9}),
     Branch(_REFINE, "colour of few pixels", {"method.motion:_HALF_COLOR_PIXELS": _LEAST}),
     # method.residual, method.confidence, method.cohesion
@@ -369,7 +369,7 @@ BRANCHES: tuple[Branch, ...] = (
     Branch(_SHARED, "opacity of a birth", {"fit.density:_BIRTH_OPACITY": 0.3}),
     Branch(_SHARED, "overlap as half", {"method.active_set:_MIN_OVERLAP": active_set.EXPLAINED}),
     # Pixels that are a share of the image.
-    Branch(_SHARES, "longest step, a share", GONE),
+    Branch(_SHARES, "longest step, a share", {"method.motion:LONGEST_PX": PerWidth(2.0)}),
     Branch(
         _SHARES,
         "responsibility at most 1280 px wide",

@@ -62,6 +62,9 @@ _ERROR_RATIO = 0.9
 _ERROR_RATIO_STATIC = 0.8
 # Weight of the prior that this step is 0, in pixels on which the contrast is 1 per px.
 _PRIOR_PIXELS = 1e-3
+# Longest step of a refinement, in px of the view where it is longest: farther away, the image is
+# not linear, and a Gaussian that leaves the images has no error left that could reject the step.
+LONGEST_PX = 2.0
 # Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is
 # noise.
 _HALF_COLOR_PIXELS = 10.0
@@ -108,7 +111,7 @@ def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums G [V, N, 3] (xx, xy, yy) and b
-    [V, N, 2].
+    [V, N, 2], shortened to `LONGEST_PX` in the view where it is longest.
     """
     G = sums["normal"][..., [0, 1, 1, 2]].reshape(*sums["normal"].shape[:2], 2, 2)
     system = np.einsum("vnia,vnij,vnjb->nab", jacobians, G, jacobians, optimize=True)
@@ -118,7 +121,9 @@ def _step(jacobians: np.ndarray, sums: Arrays, near: np.ndarray, moves: np.ndarr
     right = right + np.einsum("nk,nka->na", counts, right[near])
     # lambda, which has the unit of J' J.
     prior = max(_PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1)), 1e-30)
-    return np.linalg.solve(system + prior * np.eye(3), right[..., None])[..., 0]
+    step = np.linalg.solve(system + prior * np.eye(3), right[..., None])[..., 0]
+    length = np.linalg.norm(np.einsum("vnij,nj->vni", jacobians, step), axis=-1).max(axis=0)
+    return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]
 
 
 def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:

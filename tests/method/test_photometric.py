@@ -51,6 +51,17 @@ def test_refine_start__corrects_what_flow_left(scene, factor):
     assert np.array_equal(refined.logit_confidence, start(factor).logit_confidence)
 
 
+def test_refine_start__takes_no_step_longer_than_the_limit(scene, monkeypatch):
+    gaussians, views = scene
+    monkeypatch.setattr("morgs_mi.method.motion.LONGEST_PX", 0.1)
+    step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
+    px = [
+        view.camera.projection_jacobian(np.asarray(gaussians.means)) @ step[..., None]
+        for view in views.values()
+    ]
+    assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11
+
+
 def color_change(gaussians, views):
     """Return the change of colour of Gaussians that do not move."""
     still = MotionStart.without_motion(gaussians)
