@@ -1,4 +1,4 @@
-"""Seconds of this checkout relative to those of another commit's, in pairs that run in turn.
+"""Compare the run time of this checkout with that of another commit, run alternately in pairs.
 
     python -m benchmarks.speed.pairs BASE --recordings SETS --json benchmarks/results/pairs.json
 
@@ -31,6 +31,7 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+import morgs_mi
 from benchmarks.reports.plots import markdown
 from benchmarks.speed import frame_speed
 from benchmarks.speed.output import Output
@@ -77,8 +78,6 @@ def _later(name: str) -> dict[str, float]:
 
 def _first(name: str) -> dict[str, float]:
     """Return the seconds of a step of the first frame."""
-    import morgs_mi
-
     size = _SIZES[name]
     scene = frame_speed.Scene(size, 0)
     cameras = scene.cameras()[1:9]
@@ -97,8 +96,6 @@ def _first(name: str) -> dict[str, float]:
 
 def _splat(name: str) -> dict[str, float]:
     """Return the seconds of a step of a user's loop over the cameras."""
-    import morgs_mi
-
     scene = frame_speed.Scene(_SIZES[name], 0)
     cameras = scene.cameras()[1:9]
     images = scene.recorded(1, 0)[0][1:9]
@@ -173,6 +170,22 @@ def _run(checkout: Path, case: str, recordings: Path) -> dict[str, list[float]]:
     return json.loads(process.stdout.splitlines()[-1])
 
 
+def pair_row(figures: np.ndarray) -> dict[str, Any]:
+    """Return the ratios of P pairs, and the medians of both checkouts.
+
+    Args:
+        figures: seconds and MB [P, 2, 2], by pair, checkout (the base first) and figure.
+    """
+    ratios = figures[:, 1, 0] / figures[:, 0, 0]
+    seconds, memory = np.median(figures, 0).T
+    return {
+        "ratio": round(float(np.median(ratios)), 3),
+        "ratios": np.round(ratios, 3).tolist(),
+        "seconds": np.round(seconds, 5).tolist(),
+        "memory": np.round(memory).tolist(),
+    }
+
+
 def pairs_table(rows: Mapping[str, Any]) -> str:
     """Return the ratios of the pairs, and the medians of seconds and memory."""
     lines = []
@@ -196,16 +209,7 @@ def main(options: Options) -> None:
             [_run(tree, case, options.recordings) for tree in trees] for _ in range(options.pairs)
         ]
         for name in runs[0][0]:
-            # By pair, checkout and figure.
-            figures = np.array([[run[name] for run in pair] for pair in runs])
-            ratios = figures[:, 1, 0] / figures[:, 0, 0]
-            seconds, memory = np.median(figures, 0).T
-            rows[name] = {
-                "ratio": round(float(np.median(ratios)), 3),
-                "ratios": np.round(ratios, 3).tolist(),
-                "seconds": np.round(seconds, 5).tolist(),
-                "memory": np.round(memory).tolist(),
-            }
+            rows[name] = pair_row(np.array([[run[name] for run in pair] for pair in runs]))
             print(f"{name:36s}", rows[name], flush=True)
     command = ["git", "-C", str(options.base), "rev-parse", "--short", "HEAD"]
     process = subprocess.run(command, check=True, capture_output=True, text=True)

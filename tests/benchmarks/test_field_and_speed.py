@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import pictures
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
-from benchmarks.speed import frame_speed, stages
+from benchmarks.speed import frame_speed, pairs, stages
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.recording import CONFIG, recording
@@ -49,6 +49,16 @@ def test_host__counts_the_operations_of_a_frame_and_of_a_step(tmp_path):
     command = [sys.executable, "-m", "tests.benchmarks.count_host", str(tmp_path / "plot.png")]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
+
+
+def test_pair_row__relates_each_run_to_the_base_that_ran_before_it():
+    figures = np.array([[[2, 100], [1, 90]], [[4, 100], [3, 80]], [[10, 100], [2, 70]]])
+    row = pairs.pair_row(figures)
+    assert row["ratios"] == [0.5, 0.75, 0.2]
+    assert row["ratio"] == 0.5
+    assert row["seconds"] == [4, 2]
+    assert row["memory"] == [100, 80]
+    assert "| a | 0.50 | 0.20 to 0.75 | 4 | 2 | 100 | 80 |" in pairs.pairs_table({"a": row})
 
 
 @pytest.mark.slow
