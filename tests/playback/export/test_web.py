@@ -288,14 +288,15 @@ def test_page__draws_a_new_mode_when_its_values_arrive(browser, clip):
 
 
 VIEW = ("camera.position", "controls.target")
+# Whether ten frames leave the view where it is; the controls may round it to and fro forever.
 AT_REST = """new Promise((resolve) => {
-  let before = null;
-  const look = () => {
-    const now = player.view.camera.matrixWorldInverse.elements.join();
-    if (now === before && player.settled) resolve(true);
-    else { before = now; setTimeout(look, 300); }
+  const before = [...player.view.camera.matrixWorldInverse.elements];
+  const look = (frames) => {
+    if (frames > 0) return requestAnimationFrame(() => look(frames - 1));
+    const now = player.view.camera.matrixWorldInverse.elements;
+    resolve(player.settled && before.every((value, i) => Math.abs(value - now[i]) < 1e-6));
   };
-  look();
+  look(10);
 })"""
 
 
