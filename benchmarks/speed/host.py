@@ -18,8 +18,10 @@ Counts are the same on every run; seconds depend on what else the machine does.
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,14 +33,36 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+import morgs_mi.stream_loop
 from benchmarks.reports.plots import blank_figure, markdown, save_figure
 from benchmarks.speed import frame_speed
 from benchmarks.speed.frame_speed import Scene, Size, default_config, loop_of
 from benchmarks.speed.output import Output
-from benchmarks.speed.stages import STAGES, Profile, clocks
 from morgs_mi import FitConfig, StreamConfig, fit_gaussians
 from morgs_mi.core import arrays
+from morgs_mi.fit import later_frame
+from morgs_mi.loop import observation
+from morgs_mi.method import motion
+from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.render.kernel_recording import num_recordings
+
+STAGES: tuple[tuple[str, Any, str], ...] = (
+    ("images", observation, "copied_images"),
+    ("exposures, changes", observation, "_seen_views"),
+    ("flow, masks", observation, "_key_views"),
+    ("active set", morgs_mi.stream_loop, "find_active_set"),
+    ("active set", ActiveSet, "with_static"),
+    ("lift", motion.STARTS, "lift_flow"),
+    ("propagation", motion.STARTS, "propagate_motion"),
+    ("search", motion.STARTS, "search_motion"),
+    ("refinement", motion.STARTS, "refine_start"),
+    ("confidence", motion, "share_confidence"),
+    ("residual", morgs_mi.stream_loop, "fit_later_frame"),
+    ("steps", later_frame, "optimise"),
+    ("packet", morgs_mi.stream_loop, "residual_packet"),
+    ("decoding", morgs_mi.stream_loop, "decode"),
+)
+"""Name of a stage, and the module or table whose entry is the stage's function."""
 
 FLOOR = Size(96, 72, 20, 3_000, 2)
 """A size without arithmetic."""
@@ -65,6 +89,75 @@ class Options(Output):
     """Mitsuba variant."""
     plot: Path | None = None
     """File for a plot of the operations and seconds by stage."""
+
+
+def clocks() -> dict[str, float]:
+    """Return the wall and processor seconds so far."""
+    return {"seconds": time.perf_counter(), "processor": time.process_time()}
+
+
+class Profile:
+    """What grows in each stage of a later frame while it is entered; `other` is outside of all
+    stages, and a stage has what grows outside of the stages inside it.
+
+    Work is synchronised wherever a stage begins or ends, so a total may be longer than the time of
+    a frame that is not profiled.
+
+    Args:
+        read: returns numbers by name, which never fall.
+    """
+
+    def __init__(self, read: Callable[[], Mapping[str, float]]) -> None:
+        self.totals: dict[str, Any] = {}
+        self._open = ["other"]
+        self._patches = ExitStack()
+        self._read = read
+        self._last: Mapping[str, float] = {}
+
+    def __enter__(self) -> Profile:
+        for name, place, attribute in STAGES:
+            if isinstance(place, Mapping):
+                stage = self._timed(name, place[attribute])
+                self._patches.enter_context(patch.dict(place, {attribute: stage}))
+            else:
+                stage = self._timed(name, getattr(place, attribute))
+                self._patches.enter_context(patch.object(place, attribute, stage))
+        # One stage after the other.
+        self._patches.enter_context(patch.object(observation, "in_background", _at_once))
+        dr.sync_thread()
+        self._last = self._read()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._border()
+        self._patches.close()
+
+    def _border(self) -> None:
+        """Add what has grown since the last border to the innermost open stage."""
+        dr.sync_thread()
+        numbers = self._read()
+        total = self.totals.setdefault(self._open[-1], Counter())
+        total.update({name: value - self._last.get(name, 0) for name, value in numbers.items()})
+        self._last = numbers
+
+    def _timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def stage(*args: Any, **kwargs: Any) -> Any:
+            self._border()
+            self._open.append(name)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self._border()
+                self._open.pop()
+
+        return stage
+
+
+def _at_once(function: Callable[[], Any]) -> Future[Any]:
+    """Return the result of a function, as `in_background` does."""
+    future: Future[Any] = Future()
+    future.set_result(function())
+    return future
 
 
 class HostCounts:

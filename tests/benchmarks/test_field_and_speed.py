@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import pictures
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
-from benchmarks.speed import frame_speed, pairs, stages
+from benchmarks.speed import frame_speed, pairs
 from morgs_mi.platform.bounded import read_json
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.recording import CONFIG, recording
@@ -33,15 +33,6 @@ def test_frame_speed__measures_a_tiny_scene(tmp_path, monkeypatch):
     frame_speed.main(frame_speed.Options(out, ("tiny",), epochs=(1,), full=()))
     for run in read_json(out)["tiny"]["runs"].values():
         assert min(run["seconds"], run["bytes"], run["pixels"], run["psnr"] - 10) > 0
-
-
-def test_stages__have_all_seconds_of_a_frame(monkeypatch):
-    monkeypatch.setattr(frame_speed, "SIZES", {"tiny": frame_speed.Size(64, 48, 3, 600, 2)})
-    rows = stages.profile_scene("tiny", epochs=1)
-    total = rows.pop("total")
-    assert sum(row["seconds"] for row in rows.values()) == pytest.approx(total["seconds"], rel=0.02)
-    assert rows["steps"]["passes"] == 2 * 3  # rendered and differentiated
-    assert "| steps |" in stages.table({"tiny": rows | {"total": total}})
 
 
 def test_host__counts_the_operations_of_a_frame_and_of_a_step(tmp_path):
