@@ -35,8 +35,6 @@ from morgs_mi.method.motion_start import SOFT_LOGIT, MotionProblem, MotionStart
 
 # Steps of the grid from 0 to its end, in each direction of each axis: it has 36,000 places.
 _GRID = 16
-# Parts that are rendered at once, each in a colour of its own.
-_COLORS = 3
 # Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above
 # which it is not explained.
 _UNEXPLAINED = 3.0
@@ -49,7 +47,8 @@ _COST_RATIO = 0.3
 _ERROR_RATIO = 0.8
 # Longest displacement along each axis, as a fraction of the image width.
 _REACH = 0.1
-# Most parts of a frame, those with the largest errors first.
+# Most parts of a frame, those with the largest errors first: they are rendered at once, each in a
+# colour of its own.
 _MAX_PARTS = 3
 
 
@@ -67,10 +66,7 @@ def search_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     logit = start.logit_confidence
     gaussians = problem.gaussians
     masks = _unexplained_parts(problem, displacement, _MAX_PARTS)
-    parts: list[_Part] = []
-    for first in range(0, len(masks), _COLORS):
-        parts += _parts_of(problem, masks[first : first + _COLORS])
-    for part in parts:
+    for part in _parts_of(problem, masks) if masks else ():
         center = np.asarray(gaussians.means)[part.mask].mean(axis=0)
         d = _best_displacement(center, part.surfaces)
         if not d.any():
