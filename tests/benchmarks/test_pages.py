@@ -17,8 +17,8 @@ from benchmarks.reports.plots import grouped, span
 TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
 EVERYTHING = "\n".join(TEXTS.values())
 # Modules that only the history has.
-(HISTORY,) = re.findall(r"up to commit `[0-9a-f]{7}`:((?:\s+`[\w.]+`[,.])+)", TEXTS["index"])
-ENDED = set(re.findall(r"`([\w.]+)`", HISTORY))
+HISTORY = re.findall(r"up to commit `[0-9a-f]{7}`:((?:\s+`[\w.]+`[,;.])+)", TEXTS["index"])
+ENDED = set(re.findall(r"`([\w.]+)`", " ".join(HISTORY)))
 # "22 November 2026, commit `c41387b`", also of several days or commits.
 SETUP = r"\d+ (?:and \d+ )?[A-Z][a-z]+ \d{4},\s+commits?\s+`[0-9a-f]{7}`"
 RESULT = r"\]\(\.\./\.\./benchmarks/results/(\w+\.json)\)"
