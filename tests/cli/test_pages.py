@@ -22,7 +22,7 @@ SMALLER = {
     "synth": "--cameras 7 --frames 3 --width 160 --height 120 --spp 4",
     "fit": "--num-gaussians 1500 --first-frame-steps 60 --epochs 1",
     "live": "--calibration CAPTURE --frames 2 --first-frame-steps 30 --epochs 1",
-    "demo": "--frames 3 --cameras 7",
+    "demo": "--frames 3 --cameras 7 --width 160 --height 120 --spp 4",
     "render": "--width 240",
 }
 GUIDES = ("quickstart", "splat-files", "captures", "cameras")

@@ -40,9 +40,9 @@ def rig(tmp_path):
     return write_calibration(tmp_path / "rig")
 
 
-@pytest.fixture
-def videos(tmp_path):
-    return write_videos(tmp_path / "videos")
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    return write_videos(tmp_path_factory.mktemp("videos"))
 
 
 @pytest.fixture
