@@ -23,25 +23,33 @@ _ROUNDS = 5
 _LEAST_WEIGHT = 1e-3
 
 
-def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
-    """Return the image at a share of the time from one frame of a clip to the next [H, W, 3].
+class Between:
+    """The images between one frame of a clip and the next; the flow is computed once.
 
     Args:
         first: [H, W, 3], RGB: uint8, or float32 of linear light.
         second: likewise, of the same size and type.
-        share: in [0, 1]; 0 for the first frame, 1 for the second.
     """
-    has_light = first.dtype != np.uint8
-    if has_light:
-        first, second = map(encode_light, (first, second))
-    pair = [np.clip(image, 0, 1) if has_light else image for image in (second, first)]
-    backward, forward = FLOW_SOURCES.make("dis")(FramePair(pair[0], pair[1]))
-    first, first_weight = _contribution(first, forward, backward, share)
-    second, second_weight = _contribution(second, backward, forward, 1 - share)
-    mean = (first + second) / (first_weight + second_weight)
-    if has_light:
-        return np.maximum(decode_light(mean), 0)
-    return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
+
+    def __init__(self, first: np.ndarray, second: np.ndarray) -> None:
+        self.has_light = first.dtype != np.uint8
+        self.frames = [encode_light(i) if self.has_light else i for i in (first, second)]
+        shown = [np.clip(i, 0, 1) if self.has_light else i for i in self.frames]
+        self.backward, self.forward = FLOW_SOURCES.make("dis")(FramePair(*reversed(shown)))
+
+    def at(self, share: float) -> np.ndarray:
+        """Return the image at a share of the time between the frames [H, W, 3].
+
+        Args:
+            share: in [0, 1]; 0 for the first frame, 1 for the second.
+        """
+        first, second = self.frames
+        first, first_weight = _contribution(first, self.forward, self.backward, share)
+        second, second_weight = _contribution(second, self.backward, self.forward, 1 - share)
+        mean = (first + second) / (first_weight + second_weight)
+        if self.has_light:
+            return np.maximum(decode_light(mean), 0)
+        return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
 
 
 def _contribution(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from morgs_mi.capture.interpolation import image_between
+from morgs_mi.capture.interpolation import Between
 from morgs_mi.evaluate.metrics import psnr
 
 HEIGHT = 72
@@ -31,11 +31,11 @@ def moving_square(position):
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
-def test_image_between__shows_things_where_they_have_moved_to(share):
+def test_between__shows_things_where_they_have_moved_to(share):
     first = moving_square(0)
     second = moving_square(4)
     expected = moving_square(4 * share)
-    image = image_between(first, second, share)
+    image = Between(first, second).at(share)
     blended = (1 - share) * first + share * second
     assert image.dtype == np.uint8
     for window, gain in (((slice(24, 48), slice(38, 58)), 10), (slice(None), 2)):
@@ -46,6 +46,6 @@ def test_image_between__shows_things_where_they_have_moved_to(share):
 
 
 @pytest.mark.parametrize("share", [0, 1])
-def test_image_between__is_a_frame_at_either_end(share):
+def test_between__is_a_frame_at_either_end(share):
     frames = moving_square(0), moving_square(4)
-    assert_allclose(image_between(*frames, share).astype(int), frames[share], atol=1)
+    assert_allclose(Between(*frames).at(share).astype(int), frames[share], atol=1)

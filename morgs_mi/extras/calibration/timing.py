@@ -19,7 +19,7 @@ frame. The errors of the offsets are divided by the part of this move that the e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
 
@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.interpolation import image_between
+from morgs_mi.capture.interpolation import Between
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
@@ -175,6 +175,7 @@ class _Clip:
 
     view: View  # the reduced view
     images: list[np.ndarray]  # per frame, uint8 [H, W, 3]
+    between: dict[int, Between] = field(default_factory=dict)  # by frame, after it
 
     @classmethod
     def of(cls, capture: Capture, index: int, view: View) -> _Clip:
@@ -196,7 +197,9 @@ class _Clip:
         share = time - frame
         if share in (0, 1):
             return self.view.at(self.images[frame + round(share)])
-        return self.view.at(image_between(self.images[frame], self.images[frame + 1], share))
+        if frame not in self.between:
+            self.between[frame] = Between(self.images[frame], self.images[frame + 1])
+        return self.view.at(self.between[frame].at(share))
 
 
 @dataclass(eq=False)
