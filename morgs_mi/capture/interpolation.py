@@ -10,6 +10,8 @@ unreliable flow, because the other frame does not show it, has a small weight.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import cv2
 import numpy as np
 
@@ -24,7 +26,7 @@ _LEAST_WEIGHT = 1e-3
 
 
 class Between:
-    """The images between one frame of a clip and the next; the flow is computed once.
+    """The images between one frame of a clip and the next; their flow is computed once.
 
     Args:
         first: [H, W, 3], RGB: uint8, or float32 of linear light.
@@ -32,10 +34,8 @@ class Between:
     """
 
     def __init__(self, first: np.ndarray, second: np.ndarray) -> None:
-        self.has_light = first.dtype != np.uint8
-        self.frames = [encode_light(i) if self.has_light else i for i in (first, second)]
-        shown = [np.clip(i, 0, 1) if self.has_light else i for i in self.frames]
-        self.backward, self.forward = FLOW_SOURCES.make("dis")(FramePair(*reversed(shown)))
+        self.frames = (first, second)
+        self._has_light = first.dtype != np.uint8
 
     def at(self, share: float) -> np.ndarray:
         """Return the image at a share of the time between the frames [H, W, 3].
@@ -43,13 +43,32 @@ class Between:
         Args:
             share: in [0, 1]; 0 for the first frame, 1 for the second.
         """
-        first, second = self.frames
-        first, first_weight = _contribution(first, self.forward, self.backward, share)
-        second, second_weight = _contribution(second, self.backward, self.forward, 1 - share)
+        if share in (0, 1):
+            return self.frames[round(share)]
+        forward, backward = self._flows
+        first, second = self._encoded
+        first, first_weight = _contribution(first, forward, backward, share)
+        second, second_weight = _contribution(second, backward, forward, 1 - share)
         mean = (first + second) / (first_weight + second_weight)
-        if self.has_light:
+        if self._has_light:
             return np.maximum(decode_light(mean), 0)
         return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
+
+    @property
+    def _encoded(self) -> tuple[np.ndarray, np.ndarray]:
+        """The frames; those of linear light in display-referred values."""
+        first, second = self.frames
+        return (encode_light(first), encode_light(second)) if self._has_light else self.frames
+
+    @cached_property
+    def _flows(self) -> tuple[np.ndarray, np.ndarray]:
+        """The flow from the first frame to the second [H, W, 2], and back."""
+        first, second = self._encoded
+        if self._has_light:
+            first = np.clip(first, 0, 1)
+            second = np.clip(second, 0, 1)
+        backward, forward = FLOW_SOURCES.make("dis")(FramePair(second, first))
+        return forward, backward
 
 
 def _contribution(

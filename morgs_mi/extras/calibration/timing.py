@@ -19,8 +19,9 @@ frame. The errors of the offsets are divided by the part of this move that the e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import pairwise
 from operator import add
 
 import cv2
@@ -174,8 +175,7 @@ class _Clip:
     """The first frames of a view, reduced."""
 
     view: View  # the reduced view
-    images: list[np.ndarray]  # per frame, uint8 [H, W, 3]
-    between: dict[int, Between] = field(default_factory=dict)  # by frame, after it
+    pairs: list[Between]  # of successive frames, uint8 [H, W, 3]
 
     @classmethod
     def of(cls, capture: Capture, index: int, view: View) -> _Clip:
@@ -188,18 +188,14 @@ class _Clip:
         size = view.camera.size
         # The images are whole frames: with the capture's delays they would be displaced twice.
         view = replace(view, camera=view.camera.without_delays())
-        return cls(view, [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images])
+        images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images]
+        return cls(view, [Between(*pair) for pair in pairwise(images)])
 
     def at(self, time: float) -> View:
         """Return the view with its image of a time, in frames."""
-        time = np.clip(time, 0, len(self.images) - 1)
-        frame = min(int(time), len(self.images) - 2)
-        share = time - frame
-        if share in (0, 1):
-            return self.view.at(self.images[frame + round(share)])
-        if frame not in self.between:
-            self.between[frame] = Between(self.images[frame], self.images[frame + 1])
-        return self.view.at(self.between[frame].at(share))
+        time = np.clip(time, 0, len(self.pairs))
+        frame = min(int(time), len(self.pairs) - 1)
+        return self.view.at(self.pairs[frame].at(time - frame))
 
 
 @dataclass(eq=False)
@@ -225,7 +221,7 @@ class _Clips:
     @property
     def num_frames(self) -> int:
         """Number of frames."""
-        return len(self.clips[0].images)
+        return len(self.clips[0].pairs) + 1
 
     def at(self, times: np.ndarray) -> list[View]:
         """Return the views with their images, each at its own time [V], in frames."""
