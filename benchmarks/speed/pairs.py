@@ -1,4 +1,4 @@
-"""Compare the run time of this checkout with that of another commit, run alternately in pairs.
+"""Compare the run times of this checkout and of another commit, which run in turn.
 
     python -m benchmarks.speed.pairs BASE --recordings SETS --json benchmarks/results/pairs.json
 

@@ -25,8 +25,8 @@ _ROUNDS = 5
 _LEAST_WEIGHT = 1e-3
 
 
-class Between:
-    """The images between one frame of a clip and the next; their flow is computed once.
+class FrameInterpolation:
+    """The images between a frame of a clip and the next one. Their flow is computed once.
 
     Args:
         first: [H, W, 3], RGB: uint8, or float32 of linear light.
@@ -56,7 +56,7 @@ class Between:
 
     @property
     def _encoded(self) -> tuple[np.ndarray, np.ndarray]:
-        """The frames; those of linear light in display-referred values."""
+        """The frames [H, W, 3]; linear light is encoded."""
         first, second = self.frames
         return (encode_light(first), encode_light(second)) if self._has_light else self.frames
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from morgs_mi.capture.interpolation import Between
+from morgs_mi.capture.interpolation import FrameInterpolation
 from morgs_mi.capture.layouts.calibration import CalibratedView
 from morgs_mi.capture.lens import Lens, Undistortion, undistortion
 from morgs_mi.capture.masks import scaled_mask, used_in_clip
@@ -116,7 +116,7 @@ class RecordedView(View):
         earlier, later = self._processed([index, index + 1])
         if isinstance(earlier, Exception) or isinstance(later, Exception):
             return first
-        return first.at(Between(earlier, later).at(position - index))
+        return first.at(FrameInterpolation(earlier, later).at(position - index))
 
     def _processed(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
         """Yield the processed frames of the clip, or errors."""

@@ -66,7 +66,9 @@ def search_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     logit = start.logit_confidence
     gaussians = problem.gaussians
     masks = _unexplained_parts(problem, displacement, _MAX_PARTS)
-    for part in _parts_of(problem, masks) if masks else ():
+    if not masks:
+        return start
+    for part in _parts_of(problem, masks):
         center = np.asarray(gaussians.means)[part.mask].mean(axis=0)
         d = _best_displacement(center, part.surfaces)
         if not d.any():

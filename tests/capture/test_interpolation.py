@@ -1,12 +1,15 @@
 """Images between two frames of a clip."""
 
+from unittest.mock import Mock
+
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from morgs_mi.capture.interpolation import Between
+from morgs_mi.capture.interpolation import FrameInterpolation
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
 
 HEIGHT = 72
 WIDTH = 96
@@ -31,11 +34,11 @@ def moving_square(position):
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
-def test_between__shows_things_where_they_have_moved_to(share):
+def test_frame_interpolation__shows_things_where_they_have_moved_to(share):
     first = moving_square(0)
     second = moving_square(4)
     expected = moving_square(4 * share)
-    image = Between(first, second).at(share)
+    image = FrameInterpolation(first, second).at(share)
     blended = (1 - share) * first + share * second
     assert image.dtype == np.uint8
     for window, gain in (((slice(24, 48), slice(38, 58)), 10), (slice(None), 2)):
@@ -45,7 +48,17 @@ def test_between__shows_things_where_they_have_moved_to(share):
         assert score > blended_score + gain
 
 
-@pytest.mark.parametrize("share", [0, 1])
-def test_between__is_a_frame_at_either_end(share):
+@pytest.mark.parametrize("share", [0, 1e-6, 1 - 1e-6, 1])
+def test_frame_interpolation__is_a_frame_at_either_end(share):
     frames = moving_square(0), moving_square(4)
-    assert_allclose(Between(*frames).at(share).astype(int), frames[share], atol=1)
+    image = FrameInterpolation(*frames).at(share)
+    assert_allclose(image.astype(int), frames[round(share)], atol=1)
+
+
+def test_frame_interpolation__computes_the_flow_once_and_at_the_ends_never(monkeypatch):
+    make = Mock(wraps=FLOW_SOURCES.make)
+    monkeypatch.setattr(FLOW_SOURCES, "make", make)
+    frames = FrameInterpolation(moving_square(0), moving_square(4))
+    for share, flows in ((0, 0), (1, 0), (0.3, 1), (0.6, 1)):
+        frames.at(share)
+        assert make.call_count == flows

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.interpolation import Between
+from morgs_mi.capture.interpolation import FrameInterpolation
 from morgs_mi.capture.layouts.calibration import CalibratedImage
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
@@ -91,9 +91,9 @@ def test_process__keeps_light_positive_through_undistortion(tmp_path):
     assert image.max() > 4
 
 
-def test_between__of_equal_images_is_the_image():
+def test_frame_interpolation__of_equal_images_is_the_image():
     image = light(0, 0)
-    assert_allclose(Between(image, image).at(0.5), image, rtol=1e-4, atol=1e-6)
+    assert_allclose(FrameInterpolation(image, image).at(0.5), image, rtol=1e-4, atol=1e-6)
 
 
 def test_partial_frames__leave_out_a_broken_file(tmp_path):

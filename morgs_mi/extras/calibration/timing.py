@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.interpolation import Between
+from morgs_mi.capture.interpolation import FrameInterpolation
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.view import View
 from morgs_mi.extras.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
@@ -175,7 +175,7 @@ class _Clip:
     """The first frames of a view, reduced."""
 
     view: View  # the reduced view
-    pairs: list[Between]  # of successive frames, uint8 [H, W, 3]
+    pairs: list[FrameInterpolation]  # of successive frames, uint8 [H, W, 3]
 
     @classmethod
     def of(cls, capture: Capture, index: int, view: View) -> _Clip:
@@ -189,7 +189,7 @@ class _Clip:
         # The images are whole frames: with the capture's delays they would be displaced twice.
         view = replace(view, camera=view.camera.without_delays())
         images = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in images]
-        return cls(view, [Between(*pair) for pair in pairwise(images)])
+        return cls(view, [FrameInterpolation(*pair) for pair in pairwise(images)])
 
     def at(self, time: float) -> View:
         """Return the view with its image of a time, in frames."""
