@@ -388,14 +388,6 @@ def _block_bits(
                 touches &= ahead[i]
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
-    # The tile of each word, and the word's entries.
-    word = dr.arange(mi.UInt32, num_words)
-    tile = dr.minimum(_first_place(end_word, word + 1), opaque(mi.UInt32, num_tiles - 1))
-    first = elements(tiles.first, tile)
-    end = elements(tiles.end, tile)
-    place = first + 32 * (word - elements(end_word, tile) + elements(length, tile))
-    entries = [place + k for k in range(32)]
-    is_listed = [entry < end for entry in entries]
     # A depth limit may cut the entries that would hide later ones: no entry is omitted for its
     # transmittance.
     if farthest_limits is None:
@@ -412,13 +404,18 @@ def _block_bits(
         log2_transmitted = mi.Float64(dr.log2(1 - dr.minimum(alpha, config.alpha_max)))
         dr.eval(mask, log2_transmitted)
         behind = dr.prefix_sum(log2_transmitted)
-        start = dr.gather(mi.Float64, behind, first, is_listed[0])
+        before = dr.gather(mi.Float64, behind, elements(tiles.first, slot))
         # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
         least = log2(max(config.stop_transmittance, 1e-38)) - 0.5
-        for k, entry in enumerate(entries):
-            log2_transmittance = dr.gather(mi.Float64, behind, entry, is_listed[k]) - start
-            is_listed[k] &= ~(log2_transmittance < least)
-    masks = [dr.gather(mi.UInt32, mask, entries[k], is_listed[k]) for k in range(32)]
+        mask = dr.select(behind - before < least, 0, mask)
+    dr.eval(mask)
+    # The tile of each word, and the word's entries.
+    word = dr.arange(mi.UInt32, num_words)
+    tile = dr.minimum(_first_place(end_word, word + 1), opaque(mi.UInt32, num_tiles - 1))
+    place = 32 * (word - elements(end_word, tile) + elements(length, tile))
+    place += elements(tiles.first, tile)
+    end = elements(tiles.end, tile)
+    masks = [dr.gather(mi.UInt32, mask, place + k, place + k < end) for k in range(32)]
     words = dr.empty(mi.UInt32, num_words * 32)
     for k, row in enumerate(_transposed(masks)):
         dr.scatter(words, row, word * 32 + k, mode=dr.ReduceMode.NoConflicts)

@@ -38,6 +38,8 @@ _MOST_FEATURES = 12
 # Pixels from which the free memory is compared with what an image takes, and bytes of a pixel.
 _LARGE = 2**22
 _PIXEL_BYTES = 60
+# Checked once and not in every call.
+_DEFAULT_CONFIG = RenderConfig()
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ def rasterize(
     """
     place = "rasterize()"
     refuse_freezing(place)
-    config = config_or_default(place, config, RenderConfig())
+    config = config_or_default(place, config, _DEFAULT_CONFIG)
     _check_scene(place, gaussians, channels)
     is_stack = isinstance(camera, Sequence)
     cameras = tuple(camera) if is_stack else (camera,)
