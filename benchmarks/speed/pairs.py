@@ -2,11 +2,11 @@
 
     python -m benchmarks.speed.pairs BASE --recordings SETS --json benchmarks/results/pairs.json
 
-BASE is a checkout of the commit to compare with. Each run is a process of its own. `floor`,
-`small` and `n3dv` are the later frames that `benchmarks.speed.host` counts. `first` is a step of
-the first frame and `splat` one of a user's loop with `rasterize` and `dr.backward`: with 3,000
-Gaussians at 96x72 (`floor`), 20,000 at 512x384 (`mid`) and 300 at 32x24 (`tiny`). The other cases
-fit recordings. *Memory* is the largest of a process, in MB.
+BASE is a checkout of the commit to compare with. The two runs of a pair are a process each, which
+take turns. `floor`, `small` and `n3dv` are the later frames that `benchmarks.speed.host` counts.
+`first` is a step of the first frame and `splat` one of a user's loop with `rasterize` and
+`dr.backward`: with 3,000 Gaussians at 96x72 (`floor`), 20,000 at 512x384 (`mid`) and 300 at 32x24
+(`tiny`). The other cases fit recordings. *Memory* is the largest of a process, in MB.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -45,6 +45,9 @@ _SIZES = {
 _LATER_FRAMES = 6
 _FEW_STEPS = 100
 _MANY_STEPS = 500
+# Turns of a user's loop, whose steps take up to 1.5 times as long in one minute as in the next.
+_TURNS = 40
+_TURN_STEPS = 50
 # Recordings and the numbers of frames that are fitted.
 _RECORDINGS = {"demo": 2, "basketball": 8}
 
@@ -66,18 +69,18 @@ class Options(Output):
     """Folder of the recordings demo and basketball."""
 
 
-def _later(name: str) -> dict[str, float]:
-    """Return the seconds of a later frame."""
+def _later(name: str) -> Iterator[dict[str, float]]:
+    """Yield the seconds of a later frame."""
     size = _SIZES[name]
     scene = frame_speed.Scene(size, 0)
     images = scene.recorded(_LATER_FRAMES + 1, 0)
     loop = frame_speed.loop_of(scene, frame_speed.default_config(size, 2), images[0])
     seconds = [_seconds(partial(loop.push, views[1:])) for views in images[1:]]
-    return {f"{name}, a later frame": median(seconds[2:])}
+    yield {f"{name}, a later frame": median(seconds[2:])}
 
 
-def _first(name: str) -> dict[str, float]:
-    """Return the seconds of a step of the first frame."""
+def _first(name: str) -> Iterator[dict[str, float]]:
+    """Yield the seconds of a step of the first frame."""
     size = _SIZES[name]
     scene = frame_speed.Scene(size, 0)
     cameras = scene.cameras()[1:9]
@@ -91,11 +94,11 @@ def _first(name: str) -> dict[str, float]:
         config = morgs_mi.StreamConfig(fit=settings)
         morgs_mi.fit_gaussians(cameras, images, points, np.full(points.shape, 0.5), config)
 
-    return {f"{name}, a step of the first frame": _per_step(fit)}
+    yield {f"{name}, a step of the first frame": _per_step(fit)}
 
 
-def _splat(name: str) -> dict[str, float]:
-    """Return the seconds of a step of a user's loop over the cameras."""
+def _splat(name: str) -> Iterator[dict[str, float]]:
+    """Yield the seconds of a step of a user's loop over the cameras in each turn."""
     scene = frame_speed.Scene(_SIZES[name], 0)
     cameras = scene.cameras()[1:9]
     images = scene.recorded(1, 0)[0][1:9]
@@ -103,22 +106,25 @@ def _splat(name: str) -> dict[str, float]:
     start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
     optimizer = mi.ad.Adam(lr=1e-3, params=start.parameters())
 
-    def fit(steps: int) -> None:
-        for step in range(steps):
+    def fit() -> None:
+        for step in range(_TURN_STEPS):
             gaussians = morgs_mi.Gaussians.from_parameters(optimizer)
             color = morgs_mi.rasterize(gaussians, cameras[step % 8], ("color",)).color
             dr.backward(dr.mean(dr.abs(color - targets[step % 8]), axis=None))
             optimizer.step()
 
-    return {f"{name}, a step of a user's loop": _per_step(fit)}
+    for _ in range(2):  # compiles kernels
+        fit()
+    for _ in range(_TURNS):
+        yield {f"{name}, a step of a user's loop": _seconds(fit) / _TURN_STEPS}
 
 
 def _target(image: Any) -> Any:
     return mi.TensorXf(image.astype(np.float32) / 255)
 
 
-def _fit(recording: str) -> dict[str, float]:
-    """Return the seconds of the first and of a later frame of a recording."""
+def _fit(recording: str) -> Iterator[dict[str, float]]:
+    """Yield the seconds of the first and of the later frames of a recording."""
     frames = _RECORDINGS[Path(recording).name]
     with tempfile.TemporaryDirectory() as folder:
         command = ["morgs_mi", "fit", recording, folder + "/fit", "--frames", str(frames)]
@@ -126,7 +132,7 @@ def _fit(recording: str) -> dict[str, float]:
         report = json.loads(Path(folder, "fit", "report.json").read_text())
     first, *later = (frame["seconds"] for frame in report["frames"])
     name = Path(recording).name
-    return {f"{name}, first frame": first, f"{name}, later frames": sum(later)}
+    yield {f"{name}, first frame": first, f"{name}, later frames": sum(later)}
 
 
 def _seconds(work: Callable[[], Any]) -> float:
@@ -148,26 +154,49 @@ def _per_step(fit: Callable[[int], None]) -> float:
 _MEASURES = {"later": _later, "first": _first, "splat": _splat, "fit": _fit}
 
 
-def _measured(measure: str, argument: str) -> dict[str, list[float]]:
-    """Return seconds, and the largest memory of this process and its children in MB, by name."""
+def _measure(measure: str, argument: str) -> None:
+    """Print seconds and the largest memory of this process and its children in MB by name, in a
+    turn for each line of the standard input.
+    """
     mi.set_variant("llvm_ad_rgb")
-    seconds = _MEASURES[measure](argument)
-    users = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    memory = max(resource.getrusage(user).ru_maxrss for user in users) / 1024
-    return {name: [value, memory] for name, value in seconds.items()}
+    turns = _MEASURES[measure](argument)
+    for _ in sys.stdin:
+        seconds = next(turns, {})
+        users = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        memory = max(resource.getrusage(user).ru_maxrss for user in users) / 1024
+        print(json.dumps({name: [value, memory] for name, value in seconds.items()}), flush=True)
 
 
-def _run(checkout: Path, case: str, recordings: Path) -> dict[str, list[float]]:
-    """Return what a process with the package of a checkout measures."""
+def _pair(checkouts: Sequence[Path], case: str, recordings: Path) -> dict[str, np.ndarray]:
+    """Return median seconds and MB [C, 2] of a case, by name, with the package of C checkouts in
+    turn.
+    """
     measure, name = case.split()
     argument = str(recordings / name) if measure == "fit" else name
-    process = subprocess.run(
-        [sys.executable, __file__, "--measure", measure, argument],
-        env={**os.environ, "PYTHONPATH": str(checkout)},
-        check=True,
-        stdout=subprocess.PIPE,
-    )
-    return json.loads(process.stdout.splitlines()[-1])
+    command = [sys.executable, __file__, "--measure", measure, argument]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    processes = [
+        subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(checkout)}, **pipes)
+        for checkout in checkouts
+    ]
+    turns: list[list[dict[str, Any]]] = []
+    while not turns or turns[-1][0]:
+        turns.append([_turn(process) for process in processes])
+    for process in processes:
+        process.communicate()
+    return {
+        name: np.median([[figures[name] for figures in turn] for turn in turns[:-1]], 0)
+        for name in turns[0][0]
+    }
+
+
+def _turn(process: subprocess.Popen[str]) -> dict[str, list[float]]:
+    """Return what a process measures in its next turn; nothing after the last."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    return json.loads(process.stdout.readline())
 
 
 def pair_row(figures: np.ndarray) -> dict[str, Any]:
@@ -205,11 +234,9 @@ def main(options: Options) -> None:
     trees = (options.base, Path(__file__).parents[2])
     rows: dict[str, Any] = {}
     for case in options.cases:
-        runs = [
-            [_run(tree, case, options.recordings) for tree in trees] for _ in range(options.pairs)
-        ]
-        for name in runs[0][0]:
-            rows[name] = pair_row(np.array([[run[name] for run in pair] for pair in runs]))
+        pairs = [_pair(trees, case, options.recordings) for _ in range(options.pairs)]
+        for name in pairs[0]:
+            rows[name] = pair_row(np.array([pair[name] for pair in pairs]))
             print(f"{name:36s}", rows[name], flush=True)
     command = ["git", "-C", str(options.base), "rev-parse", "--short", "HEAD"]
     process = subprocess.run(command, check=True, capture_output=True, text=True)
@@ -218,6 +245,6 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--measure"]:
-        print(json.dumps(_measured(*sys.argv[2:])))
+        _measure(*sys.argv[2:])
     else:
         main(tyro.cli(Options))
