@@ -10,7 +10,14 @@ from __future__ import annotations
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, Attribute
 
-_OWN_RULE = {"color": 3, "depth": 1, "motion": 2, "guided_motion": 2}
+_MOTION = BY_ACTIVATED_NAME["motion"]
+# Number of floats, and the attribute that some Gaussians lack.
+_OWN_RULE: dict[str, tuple[int, Attribute | None]] = {
+    "color": (3, None),
+    "depth": (1, None),
+    "motion": (2, _MOTION),
+    "guided_motion": (2, _MOTION),
+}
 
 NORMALISED = ("depth", "motion", "guided_motion")
 """Channels that are divided by alpha: expected values, not sums."""
@@ -29,10 +36,21 @@ def channel_sizes() -> dict[str, int]:
     """Return the number of floats that each channel blends, by name, without `alpha` and
     `features`.
     """
-    return {
-        **_OWN_RULE,
-        **{name: attribute.width for name, attribute in attribute_channels().items()},
-    }
+    attributes = {name: attribute.width for name, attribute in attribute_channels().items()}
+    return {**{name: size for name, (size, _) in _OWN_RULE.items()}, **attributes}
+
+
+def required_attributes() -> dict[str, Attribute | None]:
+    """Return the attribute that some Gaussians lack and a channel requires, by the names of all
+    channels of `channel_sizes`; None: no such attribute.
+    """
+    own = {name: attribute for name, (_, attribute) in _OWN_RULE.items()}
+    return {**own, **attribute_channels()}
+
+
+def aov_names() -> list[str]:
+    """Return the channels that a scene can have as AOVs; a shape has no learned offset."""
+    return [name for name in required_attributes() if name not in ("color", "guided_motion")]
 
 
 def exr_names(channel: str, size: int) -> list[str]:
@@ -41,13 +59,3 @@ def exr_names(channel: str, size: int) -> list[str]:
         return [f"{channel}.Y"]
     suffixes = "XYZW"[:size] if size <= 4 else range(size)
     return [f"{channel}.{suffix}" for suffix in suffixes]
-
-
-def aov_attributes() -> dict[str, str | None]:
-    """Return the shape attribute that each AOV requires, by the name of the AOV; None: no
-    attribute.
-    """
-    names = {
-        channel: attribute.activated_name for channel, attribute in attribute_channels().items()
-    }
-    return {"motion": "motion", **names, "depth": None}

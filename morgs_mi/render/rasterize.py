@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.arrays import float_tensor, refuse_freezing
-from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.types import Bool, Float, Jit, Tensor, Tensors
@@ -24,7 +23,12 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.background import backdrops, over
 from morgs_mi.render.blocks import BlockLists, build_lists, touches
-from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
+from morgs_mi.render.channels import (
+    NORMALISED,
+    attribute_channels,
+    channel_sizes,
+    required_attributes,
+)
 from morgs_mi.render.compositing import Layout, blend
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
@@ -397,9 +401,8 @@ def _check_scene(
         repr(mi.variant()),
         "call mi.set_variant() first",
     )
-    motion = BY_ACTIVATED_NAME["motion"]
-    required = {"motion": motion, "guided_motion": motion, **attribute_channels()}
-    choices = ("color", "alpha", "depth", *required)
+    required = required_attributes()
+    choices = ("alpha", *required)
     for argument, names, allowed in (
         ("channels", channels, choices),
         ("detach_weights", detach_weights, (*choices, "features")),
@@ -419,14 +422,16 @@ def _check_scene(
             ", ".join(unknown),
             "use one of these, or pass other values as `features`",
         )
-    for name, attribute in required.items():
-        require(
-            name not in channels or getattr(gaussians, attribute.activated_name, None) is not None,
-            place,
-            f"channel {name!r} requires Gaussians with `{attribute.name}`",
-            "none",
-            "set it or remove the channel",
-        )
+    for name in channels:
+        attribute = required.get(name)
+        if attribute is not None:
+            require(
+                getattr(gaussians, attribute.activated_name, None) is not None,
+                place,
+                f"channel {name!r} requires Gaussians with `{attribute.name}`",
+                "none",
+                "set it or remove the channel",
+            )
 
 
 def _check_cameras(place: str, cameras: Sequence[Camera]) -> None:

@@ -21,7 +21,7 @@ from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.platform.checks import bounded, errors_at, require
 from morgs_mi.platform.config import check_value
-from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
+from morgs_mi.render.channels import aov_names, channel_sizes, exr_names, required_attributes
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
@@ -328,7 +328,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             self.config = RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
-        choices = aov_attributes()
+        choices = aov_names()
         expected = f"`aovs` must be out of {', '.join(choices)}"
         for name in self.aovs:
             require(name in choices, PLACE, expected, repr(name), "separate them by commas")
@@ -447,8 +447,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         _check_scene(scene, film, len(views), border, self.surfaces is not None)
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        required = (aov_attributes()[name] for name in self.aovs)
-        attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
+        required = (required_attributes()[name] for name in self.aovs)
+        attributes = ["opacities", "sh_coeffs", *(row.activated_name for row in required if row)]
         gaussians = _scene_gaussians(scene, attributes)
         colors = ("color", "alpha") if has_alpha else ("color",)
         channels = (*colors, *self.aovs)

@@ -7,8 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.attributes import BY_ACTIVATED_NAME
-from morgs_mi.render.channels import aov_attributes, channel_sizes, exr_names
+from morgs_mi.render.channels import aov_names, channel_sizes, exr_names, required_attributes
 from morgs_mi.surfaces import gaussian_splat
 
 TEXT = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")
@@ -51,9 +50,8 @@ def test_mitsuba_page__lists_all_properties():
 
 def test_mitsuba_page__lists_all_channels():
     (row,) = re.findall(r"^\| `aovs` \|.*", TEXT, re.MULTILINE)
-    assert set(re.findall(r"`(\w+)` \(", row)) == {*aov_attributes()}
-    for channel in aov_attributes():
+    assert set(re.findall(r"`(\w+)` \(", row)) == {*aov_names()}
+    for channel in aov_names():
         assert all(f"`{name}`" in row for name in exr_names(channel, channel_sizes()[channel]))
-    assert all(
-        f"`SHAPE.{name}`" in TEXT for name in aov_attributes().values() if name in BY_ACTIVATED_NAME
-    )
+        attribute = required_attributes()[channel]
+        assert attribute is None or f"`SHAPE.{attribute.activated_name}`" in TEXT

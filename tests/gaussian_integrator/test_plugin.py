@@ -295,7 +295,7 @@ def test_gaussian_splat__refuses_films_other_than_rgb():
 @pytest.mark.parametrize(
     ("props", "message"),
     [
-        ({"aovs": "normal"}, "`aovs` must be out of motion, confidence, depth, got 'normal'"),
+        ({"aovs": "normal"}, "`aovs` must be out of depth, motion, confidence, got 'normal'"),
         ({"max_depth": 3}, "unreferenced property"),
         ({"background": "white"}, "`background` must be one or three finite .* got a str"),
         ({"background": {"type": "checkerboard"}}, "`background` must be .* got a Texture"),

@@ -134,7 +134,7 @@ BACKGROUND = "`background` must be three finite numbers of at most 1e18, or an i
     [
         ({"gaussians": None}, "`gaussians` must be Gaussians, got a NoneType"),
         ({"channels": "color"}, "`channels` must be a sequence of names, got 'color'"),
-        ({"channels": ("colour",)}, "`channels` must be out of color, alpha"),
+        ({"channels": ("colour",)}, "`channels` must be out of alpha, color"),
         ({"background": (1, 2)}, BACKGROUND),
         ({"background": (0, 0, np.nan)}, BACKGROUND),
         ({"background": (0, 0, 1e30)}, BACKGROUND),
