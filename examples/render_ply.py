@@ -9,7 +9,7 @@ import morgs_mi
 
 path, output = sys.argv[1:]
 gaussians = morgs_mi.read_splats(path)
-camera = morgs_mi.open_stream(path).cameras[0]  # of the training, or of a rig around the Gaussians
+camera = morgs_mi.open_stream(path).cameras[0]  # of a rig around the Gaussians
 print(gaussians, camera, sep="\n")
 
 scene = mi.load_dict(

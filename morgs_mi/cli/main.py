@@ -77,7 +77,7 @@ OLD_OPTIONS = {
     "--loop": "went: a video is played once; name a longer one",
     "--open-browser": "is now --browser",
     "--no-open-browser": "is now --no-browser",
-    "--reproducible": "went: every fit on a CPU is reproducible; leave it out",
+    "--reproducible": "went: on a CPU, fits without a limit of the clock are; leave it out",
     "--segments": "is now --chunks",
     "--test-view": "is now --hold-out",
     "--validate": "went: the time of its trials is left to the first frame; leave it out",

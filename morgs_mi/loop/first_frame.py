@@ -107,9 +107,11 @@ def fit_gaussians(
         progress: called with (stage, done, total).
 
     Example:
-        >>> fitted = morgs_mi.fit_gaussians(scene.sensors(), [mi.render(scene, sensor=s)
-        ...                                                   for s in scene.sensors()])
-        >>> image = morgs_mi.rasterize(fitted.gaussians, scene.sensors()[0], config=fitted.render)
+        >>> sensors = scene.sensors()
+        >>> images = [mi.render(scene, sensor=sensor) for sensor in sensors]
+        >>> fitted = morgs_mi.fit_gaussians(sensors, images)
+        >>> camera = morgs_mi.Camera.from_sensor(sensors[0])
+        >>> image = morgs_mi.rasterize(fitted.gaussians, camera, config=fitted.render)
 
     Raises:
         ValueError: as for `StreamLoop` and `StreamLoop.push`.

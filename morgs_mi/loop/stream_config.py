@@ -5,8 +5,9 @@ Presets:
     l, s                              8 and 5 passes over the views for every later frame
     baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with
                                       offset; with confidence
-    paper                             all three modules; motion starts from zero instead of the
-                                      lifted flow, one gate, constant learning rates
+    paper                             all three modules; motion and confidence do not start from
+                                      the lifted flow, one gate, constant learning rates, motion
+                                      rendered to first order
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no
 preset. `platform.config` reads settings from TOML files and writes them.

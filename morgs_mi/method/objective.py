@@ -183,7 +183,8 @@ class Term:
     weight: float | None = None  #: Lambda; None: the setting NAME_weight, 1 without one.
 
 
-# Terms that every fit may have: recorded steps compute them, without `Prediction.extent`.
+# Terms that every fit may have. Recorded steps compute them, where `Prediction.extent` is 1 and
+# Gaussians and parameters are padded: use sums times a share there, no means over Gaussians.
 TERMS: tuple[Term, ...] = (
     Term(  # eq. 2
         "recon",

@@ -7,8 +7,8 @@ size are free, because shadows and light change where nothing moves and uncovere
 be filled. The paper has one gate for all attributes. Which attribute belongs to which gate is a
 column of the attribute table (`core.attributes`).
 
-The parameters are a dict of raw tensors. All are zero at the start of a frame except the
-confidence, which carries over.
+The parameters are a dict of raw tensors, which a frame starts at zero but for the confidence, which
+carries over, and for what a `MotionStart` gives.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class Planes:
 
     def of(self, image: Float) -> Float:
         """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see
-        `memory.owned_copy`).
+        `owned_copy`).
         """
         target = dr.empty(mi.Float, self.size)
         strip, y, places = self._strips(self.num_columns * COLUMN)

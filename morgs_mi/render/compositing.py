@@ -173,7 +173,7 @@ def padded(image: Float, region: DrawnBlocks, size: int) -> Float:
     if dr.width(image) != dr.prod(region.shape(size)):
         return dr.opaque(mi.Float, 0, total)
     if not region.whole or region.row == region.width:
-        # In memory allocated by Dr.Jit (see `memory.owned_copy`); a product fuses with the kernel
+        # In memory allocated by Dr.Jit (see `owned_copy`); a product fuses with the kernel
         # of the gradient.
         return image * opaque(mi.Float, 1)
     row, column = quotient_and_rest(dr.arange(mi.UInt32, total), region.row * size)

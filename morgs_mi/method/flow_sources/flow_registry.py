@@ -59,8 +59,8 @@ FLOW_SOURCES: Registry[FlowSource, FlowConfig] = Registry(
     "MotionConfig()", "flow_method", FlowConfig
 )
 """Sources by name: a key of `FLOW_METHODS`; ``files:FOLDER`` (see `files`); ``onnx:FILE`` (see
-`network`) for a network that takes values from 0 to 255, ``onnx-unit:FILE`` for one that takes 0 to
-1, ``onnx-signed:FILE`` for one that takes -1 to 1.
+`extras.networks.flow_network`) for a network that takes values from 0 to 255, ``onnx-unit:FILE``
+for one that takes 0 to 1, ``onnx-signed:FILE`` for one that takes -1 to 1.
 """
 
 
