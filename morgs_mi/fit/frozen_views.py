@@ -32,7 +32,7 @@ from morgs_mi.method.observed_view import ObservedView
 from morgs_mi.method.residual import apply_residual
 from morgs_mi.method.ssim import Comparison
 from morgs_mi.method.ssim_layout import RUN, Lanes, Planes
-from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.active_view import ActiveView, StaticSplats
 from morgs_mi.render.backend import elements, sections
 from morgs_mi.render.channels import channel_sizes
 from morgs_mi.render.padded_region import (
@@ -70,7 +70,6 @@ class LaterLosses:
     motion: MotionConfig  #: Gates of the residual.
     render: RenderConfig  #: Cut-offs.
     num_static: int  #: Static splats that it has room for.
-    static_size: int  #: Size of the arrays that hold the static splats of all views.
 
     def __call__(
         self,
@@ -261,51 +260,50 @@ class LaterSteps:
         objective: ObjectiveConfig,
         motion: MotionConfig,
     ) -> None:
-        statics = [view.static_splats for view in views.values() if view.static_splats is not None]
-        self._num_static = room_for("static splats", max(map(len, statics), default=0))
-        splats_of_views = {id(static.together): static.together for static in statics}
-        most = max(map(len, splats_of_views.values()), default=0)
-        static_size = room_for("static splats of all views", most)
-        columns = {key: _columns(splats, static_size) for key, splats in splats_of_views.items()}
         self._objective = objective
-        self._views: dict[int, StepView] = {}
+        self._motion = motion
+        self._static = _StaticArguments([view.static_splats for view in views.values()])
         compared_views = {v: ComparedView.of(view) for v, view in views.items()}
         shared_sizes = SharedSizes([*compared_views.values()])
-        for v, compared_view in compared_views.items():
-            view = views[v]
-            region = compared_view.region
-            sizes = shared_sizes.sizes(region)
-            images = {name: view.crop(array) for name, array in view.observed.items()}
-            observed = {"target": None, **images}
-            channels = channels_of(observed, objective)
-            shapes = {
-                name: image.shape if region.whole else (sizes.num_blocks, *image.shape[1:])
-                for name, image in images.items()
-            }
-            packing, arrays = shared_sizes.arrays(compared_view)
-            static = view.static_splats
-            if static is None:
-                arrays["static"] = _no_static(channels, static_size)
-                arrays["static_range"] = from_numpy(mi.UInt32, [0, 0])
-            else:
-                arrays["static"] = _with_channels(columns[id(static.together)], channels)
-                arrays["static_range"] = from_numpy(mi.UInt32, [static.first, static.count])
-            arrays["observed"] = {
-                name: from_numpy(mi.Float, filled(image.ravel(), int(np.prod(shapes[name]))))
-                for name, image in images.items()
-            }
-            losses = LaterLosses(
-                packing,
-                tuple(shapes.items()),
-                objective,
-                motion,
-                view.config,
-                self._num_static,
-                static_size,
-            )
-            terms = active_terms(observed, parameters, objective)
-            names = (*(term.name for term in terms), SQUARED_ERROR)
-            self._views[v] = StepView(losses, names, sizes, arrays)
+        self._views = {
+            v: self._step_view(view, compared_views[v], shared_sizes, parameters)
+            for v, view in views.items()
+        }
+
+    def _step_view(
+        self,
+        view: ObservedView,
+        compared_view: ComparedView,
+        shared_sizes: SharedSizes,
+        parameters: Tensors,
+    ) -> StepView:
+        """Return an active view as arguments of its steps."""
+        region = compared_view.region
+        sizes = shared_sizes.sizes(region)
+        packing, arrays = shared_sizes.arrays(compared_view)
+        images = {name: view.crop(array) for name, array in view.observed.items()}
+        shapes = {
+            name: image.shape if region.whole else (sizes.num_blocks, *image.shape[1:])
+            for name, image in images.items()
+        }
+        arrays["observed"] = {
+            name: from_numpy(mi.Float, filled(image.ravel(), int(np.prod(shapes[name]))))
+            for name, image in images.items()
+        }
+        observed = {"target": None, **images}
+        channels = channels_of(observed, self._objective)
+        arrays |= self._static.of(view.static_splats, channels)
+        losses = LaterLosses(
+            packing,
+            tuple(shapes.items()),
+            self._objective,
+            self._motion,
+            view.config,
+            self._static.most,
+        )
+        terms = active_terms(observed, parameters, self._objective)
+        names = (*(term.name for term in terms), SQUARED_ERROR)
+        return StepView(losses, names, sizes, arrays)
 
     def of(self, previous: Gaussians, num_gaussians: int, extent: float) -> RecordedSteps:
         """Return the steps of some active Gaussians.
@@ -328,7 +326,7 @@ class LaterSteps:
         }
         dr.make_opaque(shared)
         weights = weights_of(self._objective)
-        num_splats = size + self._num_static
+        num_splats = size + self._static.most
         return RecordedSteps(self._views, shared, weights, num_splats, (count, size))
 
 
@@ -398,40 +396,66 @@ def _row_shape(name: str, width: int) -> tuple[int, ...]:
     return (width // 3, 3) if name == "sh_coeffs" else BY_NAME[name].shape
 
 
-def _columns(splats: Splats, size: int) -> dict[str, Any]:
-    """Return splats as arguments of a recording, in arrays of a fixed size. A recording infers the
-    size of a launch from an array of that size, and lengths that vary can coincide with it.
+class _StaticArguments:
+    """Static splats of the views of a frame as arguments of recordings.
+
+    Args:
+        views: static splats of each view; None: a view has none.
+
+    Attributes:
+        most: splats that a view has room for.
     """
-    names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid", "channels")
-    lane = dr.arange(mi.UInt32, size)
-    is_splat = lane < opaque(mi.UInt32, len(splats))
-    columns = dr.gather(dict, {name: vars(splats)[name] for name in names}, lane, is_splat)
-    dr.eval(columns)
-    return columns
 
+    def __init__(self, views: Sequence[StaticSplats | None]) -> None:
+        present = [static for static in views if static is not None]
+        self.most = room_for("static splats", max(map(len, present), default=0))
+        groups = {id(static.together): static.together for static in present}
+        most = max(map(len, groups.values()), default=0)
+        self._size = room_for("static splats of all views", most)
+        self._columns = {key: self._columns_of(splats) for key, splats in groups.items()}
 
-def _with_channels(columns: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return the arguments of a recording that draws some channels."""
-    return {**columns, "channels": {name: columns["channels"][name] for name in names}}
+    def of(self, static: StaticSplats | None, channels: Sequence[str]) -> dict[str, Any]:
+        """Return the arguments of a recording that draws some channels of a view."""
+        if static is None:
+            bounds = [0, 0]
+            columns = self._nothing(channels)
+        else:
+            bounds = [static.first, static.count]
+            columns = self._columns[id(static.together)]
+            columns = {
+                **columns,
+                "channels": {name: columns["channels"][name] for name in channels},
+            }
+        return {"static": columns, "static_range": from_numpy(mi.UInt32, bounds)}
 
+    def _columns_of(self, splats: Splats) -> dict[str, Any]:
+        """Return splats in arrays of a fixed size. A recording infers the size of a launch from an
+        array of that size, and lengths that vary can coincide with it.
+        """
+        names = ("mean", "conic", "log2_opacity", "depth", "radius", "valid", "channels")
+        lane = dr.arange(mi.UInt32, self._size)
+        is_splat = lane < opaque(mi.UInt32, len(splats))
+        columns = dr.gather(dict, {name: vars(splats)[name] for name in names}, lane, is_splat)
+        dr.eval(columns)
+        return columns
 
-def _no_static(channels: Sequence[str], size: int) -> dict[str, Any]:
-    """Return no static splats, in arrays of a size."""
-    widths = channel_sizes()
+    def _nothing(self, channels: Sequence[str]) -> dict[str, Any]:
+        """Return no splats in arrays of that size."""
+        widths = channel_sizes()
 
-    # Arrays of their own: a recording takes two that share memory for one.
-    def zeros(count: int) -> list[Float]:
-        return [from_numpy(mi.Float, np.zeros(size)) for _ in range(count)]
+        # Arrays of their own: a recording takes two that share memory for one.
+        def zeros(count: int) -> list[Float]:
+            return [from_numpy(mi.Float, np.zeros(self._size)) for _ in range(count)]
 
-    return {
-        "mean": mi.Point2f(zeros(2)),
-        "conic": mi.Vector3f(zeros(3)),
-        "log2_opacity": zeros(1)[0],
-        "depth": zeros(1)[0],
-        "radius": mi.Vector2f(zeros(2)),
-        "valid": from_numpy(mi.Bool, np.zeros(size, bool)),
-        "channels": {name: tuple(zeros(widths[name])) for name in channels},
-    }
+        return {
+            "mean": mi.Point2f(zeros(2)),
+            "conic": mi.Vector3f(zeros(3)),
+            "log2_opacity": zeros(1)[0],
+            "depth": zeros(1)[0],
+            "radius": mi.Vector2f(zeros(2)),
+            "valid": from_numpy(mi.Bool, np.zeros(self._size, bool)),
+            "channels": {name: tuple(zeros(widths[name])) for name in channels},
+        }
 
 
 def _comparison(region: PaddedRegion, words: Inputs, view: Inputs) -> Comparison:
