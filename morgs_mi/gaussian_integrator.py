@@ -41,7 +41,7 @@ from morgs_mi.core.arrays import from_numpy, owned_copy
 from morgs_mi.core.attributes import shape_attribute_widths
 from morgs_mi.core.gaussians import ActivatedGaussians, require_some
 from morgs_mi.core.types import SceneDict
-from morgs_mi.platform.checks import require
+from morgs_mi.platform.checks import check_type, require
 from morgs_mi.platform.extras import enter, extra, places
 
 # The class of a plugin, as extras enter theirs.
@@ -97,22 +97,34 @@ def update_ellipsoids(params: Any, gaussians: ActivatedGaussians, shape: str = "
         shape: name of the shape.
 
     Raises:
-        ValueError: the scene has no such shape.
+        ValueError: the scene has no such shape, there are no Gaussians, or they lack an attribute
+            that the shape has.
     """
+    place = "update_ellipsoids()"
+    check_type(place, "params", params, mi.SceneParameters, "pass mi.traverse(scene)")
     require(
         f"{shape}.data" in params,
-        "update_ellipsoids()",
+        place,
         f"`params` must have {shape}.data",
         "none",
         "name the shape that morgs_mi.ellipsoids() made",
     )
+    require_some(place, gaussians, "remove the shape from the scene")
+    names = [name for name in shape_attribute_widths() if f"{shape}.{name}" in params]
+    for name in names:
+        require(
+            getattr(gaussians, name, None) is not None,
+            place,
+            f"`gaussians` must have `{name}`, as the shape has",
+            "none",
+            "load the scene anew, or give them one",
+        )
     quats: Any = gaussians.quats
     length = dr.maximum(dr.sum(dr.square(quats), axis=1), 1e-30)
     xyzw = (quats * dr.rsqrt(length)[:, None])[:, mi.UInt32(1, 2, 3, 0)]
     params[f"{shape}.data"] = dr.concat([gaussians.means, gaussians.scales, xyzw], axis=1).array
-    for name in shape_attribute_widths():
-        if f"{shape}.{name}" in params and getattr(gaussians, name, None) is not None:
-            params[f"{shape}.{name}"] = getattr(gaussians, name).array
+    for name in names:
+        params[f"{shape}.{name}"] = getattr(gaussians, name).array
     params.update()
 
 

@@ -259,6 +259,11 @@ def new(cameras_of_loop=None, points=(), colors=(), **more):
             lambda _: new([mi.load_dict(cameras()[0].sensor())]),
             r"got a ProjectiveCamera; convert a Mitsuba sensor by Camera.from_sensor\(\)",
         ),
+        (lambda _: new([View(mi.load_dict(cameras()[0].sensor()))]), "got a ProjectiveCamera"),
+        (
+            lambda _: new([View(camera, mask=np.zeros((72, 96), bool)) for camera in cameras()]),
+            "the masks of `views` must have a valid pixel",
+        ),
         (lambda _: new(config={}), "`config` must be a .*StreamConfig, got a dict"),
         (
             lambda _: new(None, np.full((200, 3), np.nan), np.zeros((200, 3))),

@@ -37,7 +37,7 @@ OF_SENSOR = "convert a Mitsuba sensor by Camera.from_sensor()"
 """Remedy where another value than a camera is passed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera in OpenCV's convention.
 

@@ -190,7 +190,7 @@ class _RepeatEach(dr.CustomOp):
         self.set_grad_out(dr.repeat(self.grad_in("x"), self.count))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """N Gaussians as raw (optimisable) Dr.Jit tensors of the active Mitsuba variant.
 
@@ -281,6 +281,14 @@ class Gaussians:
             ValueError: a scale or an opacity out of these ranges, and as for `Gaussians`.
         """
         place = "Gaussians.from_activated()"
+        for name, values in (("scales", scales), ("opacities", opacities)):
+            require(
+                not dr.grad_enabled(values),
+                place,
+                f"`{name}` must not be attached to gradients",
+                "a Dr.Jit array that is",
+                "pass Gaussians(log_scales=dr.log(scales), ...)",
+            )
         opacities = numbers(place, "opacities", opacities)
         scales = numbers(place, "scales", scales)
         for name, values, high in (("scales", scales, np.inf), ("opacities", opacities, 1)):
@@ -365,6 +373,8 @@ class Gaussians:
         Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree
         becomes 0.
         """
+        if "sh_rest" in parameters and "sh_dc" not in parameters:
+            parameters = {**parameters, "sh_dc": split_sh(self.sh_coeffs)[0]}
         return replace(self, **_raw_attributes(parameters))
 
     def items(self) -> Tensors:
@@ -393,7 +403,7 @@ class Gaussians:
 
     def select(self, index: np.ndarray) -> Gaussians:
         """Return the Gaussians at `index` [M] (integers, or a mask [N]), without gradients."""
-        rows = np.arange(len(self))[index]
+        rows = np.atleast_1d(np.arange(len(self))[index])
         if not len(rows):
             return Gaussians(**{name: value[rows] for name, value in self.numpy().items()})
         lanes = from_numpy(mi.UInt32, rows)
@@ -408,15 +418,17 @@ class Gaussians:
         Raises:
             ValueError: there are no parts, or they have different attributes.
         """
-        columns = [part.detached().items() for part in parts]
         require(
-            len({tuple(column) for column in columns}) == 1,
+            len({(part.sh_degree, *part.items()) for part in parts}) == 1,
             "Gaussians.concatenate()",
-            "`parts` must hold at least one, all with the same attributes",
-            [sorted(column) for column in columns],
+            "`parts` must hold at least one, all with the same attributes and SH degree",
+            [(f"SH degree {part.sh_degree}", *part.items()) for part in parts],
             "drop or add `motion`, `offset` and `logit_confidence`",
         )
         count = sum(map(len, parts))
+        if not count:
+            return parts[0]
+        columns = [part.detached().items() for part in parts if len(part)]
         values = {}
         for name, first in columns[0].items():
             numbers = concatenated([column[name].array for column in columns])

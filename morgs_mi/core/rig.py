@@ -175,8 +175,9 @@ def with_near_planes(
         near: depth of all near planes instead, world units.
 
     Raises:
-        ValueError: `near` is not positive.
+        ValueError: `near` is not positive, or there are no cameras.
     """
+    require(cameras, "with_near_planes()", "`cameras` must be at least one", "none", "pass a rig")
     if near is not None:
         return tuple(replace(camera, near=near) for camera in cameras)
     positions = positions_of(cameras)

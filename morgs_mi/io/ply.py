@@ -67,12 +67,18 @@ def write_ply(
             other than Mitsuba and this package do not read.
 
     Raises:
-        ValueError: another layout.
+        ValueError: another layout, or values that are not finite.
         OSError: the file cannot be written.
     """
     if layout not in ("3dgs", "mitsuba"):
         raise ValueError(f"write_ply(): `layout` must be 3dgs or mitsuba, got {layout!r}.")
     raw = gaussians.numpy()
+    invalid = [name for name, values in raw.items() if not np.isfinite(values).all()]
+    if invalid:
+        raise ValueError(
+            f"write_ply(): `gaussians` must be finite, got others in `{invalid[0]}`; leave them "
+            "out by gaussians.select()."
+        )
     columns = {_MEAN: raw["means"], _NORMAL: np.zeros_like(raw["means"])}
     N, K = raw["sh_coeffs"].shape[:2]
     if layout == "mitsuba":

@@ -17,7 +17,7 @@ from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.view import View, Views
 from morgs_mi.loop.seen_view import SeenView
 from morgs_mi.method.exposure import thumbnail
-from morgs_mi.platform.checks import kind_of
+from morgs_mi.platform.checks import kind_of, require
 from morgs_mi.platform.threads import map_in_threads
 
 InputImage: TypeAlias = Any
@@ -53,6 +53,13 @@ def as_array(image: Any) -> Any:
     Any other value is returned as it is.
     """
     if isinstance(image, mi.Bitmap):
+        require(
+            image.pixel_format() != mi.Bitmap.PixelFormat.MultiChannel,
+            "images",
+            "a bitmap must be grey or have colours",
+            f"{image.channel_count()} channels",
+            "pass one of the parts that `split()` returns",
+        )
         is_display = image.srgb_gamma() and image.component_format() == mi.Struct.Type.UInt8
         number = mi.Struct.Type.UInt8 if is_display else mi.Struct.Type.Float32
         return np.array(image.convert(mi.Bitmap.PixelFormat.RGB, number, is_display))

@@ -122,14 +122,19 @@ def prepare(
     setup_views = []
     for v, view in enumerate(views):
         if not isinstance(view, View):
-            check_type("StreamLoop()", "views", view, Camera, OF_SENSOR)
             view = View(view)
+        check_type("StreamLoop()", "views", view.camera, Camera, OF_SENSOR)
         mask = view.mask
         if mask is not None:
             place = f"StreamLoop(): view {view.name or v!r}"
             check_mask(place, mask, view.camera.height, view.camera.width)
             mask = mask.copy()
         setup_views.append(View(view.camera, mask=mask))
+    if not any(view.mask is None or view.mask.any() for view in setup_views):
+        raise ValueError(
+            "StreamLoop(): the masks of `views` must have a valid pixel, got none in any view; "
+            "true pixels are used."
+        )
     setup_views = Views(setup_views)
     cameras = setup_views.cameras
     points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)

@@ -64,7 +64,8 @@ def render_stream(
     """
     config = render_config(stream)
     for frame, gaussians in play(stream):
-        yield frame, render(gaussians, camera, channels or available_channels(gaussians), config)
+        names = available_channels(gaussians) if channels is None else channels
+        yield frame, render(gaussians, camera, names, config)
 
 
 def camera_sheet(stream: FrameSource, width: int) -> np.ndarray:

@@ -30,8 +30,8 @@ def backdrops(cameras: Sequence[Camera], config: RenderConfig) -> list[np.ndarra
 def over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:
     """Return flat colours with the sums of their weights, composited over the background."""
     color: Any = background
-    if dr.is_array_v(color):
-        behind = color.array if dr.is_tensor_v(color) else dr.ravel(color)
+    if dr.is_jit_v(color):
+        behind = mi.Float(color.array if dr.is_tensor_v(color) else dr.ravel(color))
     else:
         behind = from_numpy(mi.Float, np.asarray(color, np.float32).ravel())
     if dr.width(behind) == dr.width(values):

@@ -148,7 +148,7 @@ class Splats:
         return {**{name: vars(others)[name] for name in self._present}, "channels": channels}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AttachedCamera(Camera):
     """Camera with intrinsics that get gradients, in pixels, with the values of `K`."""
 

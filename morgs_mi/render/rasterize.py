@@ -519,7 +519,7 @@ def _check_background(place: str, background: Any, shape: tuple[int, ...]) -> No
     values = np.squeeze(background) if dr.is_array_v(background) else background
     require(
         np.shape(values) in ((3,), shape)
-        and (np.abs(numbers(place, "background", values)) <= FARTHEST).all(),
+        and (np.abs(numbers(place, "background", values), dtype=float) <= FARTHEST).all(),
         place,
         f"`background` must be three finite numbers of at most 1e18, or an image {list(shape)}",
         kind_of(values) if np.ndim(values) > 1 else repr(values),
@@ -533,7 +533,7 @@ def _check_means2d(
     """Raise an error unless the means of a view can be probed."""
     N = int(gaussians.means.shape[0])
     require(
-        dr.is_tensor_v(means2d) and tuple(means2d.shape) == (N, 4),
+        isinstance(means2d, mi.TensorXf) and tuple(means2d.shape) == (N, 4),
         place,
         f"`means2d` must be a tensor of zeros [{N}, 4]",
         f"a {type(means2d).__name__} {list(np.shape(means2d))}",

@@ -400,7 +400,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             if surfaces is not None:
                 surfaces.forward(params)
             with render_lock:
-                dr.forward_to(image)
+                # The tangents of the parameters stay for other terms of the loss.
+                dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
             return dr.grad(image)
 
     def render_backward(

@@ -162,7 +162,12 @@ def _detached(shapes: list[mi.Shape]) -> Iterator[None]:
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
     tables = [(shape, mi.traverse(shape)) for shape in shapes]
-    attached = [(params, key, params[key]) for shape, params in tables for key in _attached(shape)]
+    # Copies: a parameter is a reference to the shape's value.
+    attached = [
+        (params, key, type(params[key])(params[key]))
+        for shape, params in tables
+        for key in _attached(shape)
+    ]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:
@@ -273,7 +278,7 @@ class SurfaceView:
         dr.set_grad(self.image, tangent)
         values = self._attached_environment()
         if values is not None:
-            dr.set_grad(self.behind, dr.forward_to(values))
+            dr.set_grad(self.behind, dr.forward_to(values, flags=dr.ADFlag.ClearEdges))
 
     def backward(self, params: Any) -> None:
         """Propagate the gradients of `image` and `behind` to the surfaces' parameters, adding to
@@ -308,7 +313,14 @@ class SurfaceView:
         """Return whether any parameter of the surfaces is differentiated."""
         attached = _attached(self.scene)
         params: Any = mi.traverse(self.scene)
-        moving = [name for name in attached if params.flags(name) & mi.ParamFlags.Discontinuous]
+        # Mitsuba says it of an environment's image too, behind which nothing is hidden.
+        environments = [e.id() for e in self.scene.emitters() if e.is_environment()]
+        moving = [
+            name
+            for name in attached
+            if params.flags(name) & mi.ParamFlags.Discontinuous
+            and name.partition(".")[0] not in environments
+        ]
         if moving:
             _log.warning(
                 f"{PLACE}: gradients of the surfaces' positions lack what changes with "

@@ -153,3 +153,9 @@ def test_look_at__has_a_near_plane_before_its_target():
     for distance, near in ((5.0, 0.01), (0.02, 2e-4)):
         camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
         assert camera.near == pytest.approx(near)
+
+
+def test_camera__is_equal_to_itself_alone():
+    first, second = (Camera.look_at((0, y, -4), (0, 0, 0), (0, -1, 0), 40, 48, 32) for y in (0, 1))
+    assert second in [first, second]
+    assert {first: 1}.get(second) is None

@@ -127,3 +127,36 @@ def test_repr__has_number_degree_and_size():
     text = "Gaussians(N=5, SH degree 2, box of 2 x 1 x 0.25, motion, logit_confidence)"
     assert repr(gaussians) == text
     assert repr(gaussians.select(np.zeros(5, bool))).startswith("Gaussians(N=0, SH degree 2, box")
+
+
+def test_concatenate__skips_empty_parts_and_refuses_other_degrees():
+    none = cloud(1).select(np.zeros(5, bool))
+    joined = Gaussians.concatenate([none, cloud(1), none, cloud(1)])
+    assert np.array_equal(joined.means, np.concatenate([cloud(1).means] * 2))
+    assert len(Gaussians.concatenate([none, none])) == 0
+    with pytest.raises(ValueError, match=r"the same attributes and SH degree, got .*SH degree 2"):
+        Gaussians.concatenate([cloud(1), cloud(2)])
+
+
+def test_with_parameters__takes_the_rest_of_the_harmonics_alone():
+    gaussians = cloud(1)
+    rest = gaussians.parameters()["sh_rest"]
+    changed = gaussians.with_parameters({"sh_rest": 2 * rest})
+    assert np.array_equal(changed.sh_coeffs[:, 1:], 2 * np.asarray(rest))
+    assert np.array_equal(changed.sh_coeffs[:, :1], gaussians.sh_coeffs[:, :1])
+
+
+def test_from_activated__refuses_values_that_would_lose_their_gradients():
+    gaussians = cloud(0)
+    scales = mi.TensorXf(gaussians.scales)
+    dr.enable_grad(scales)
+    others = (gaussians.quats, gaussians.opacities, gaussians.sh_coeffs)
+    with pytest.raises(ValueError, match="`scales` must not be attached to gradients"):
+        Gaussians.from_activated(gaussians.means, scales, *others)
+
+
+def test_gaussians__are_equal_to_themselves_alone():
+    gaussians = cloud(0)
+    assert gaussians == gaussians
+    assert gaussians != cloud(0)
+    assert {gaussians: 1}[gaussians] == 1

@@ -22,6 +22,11 @@ def nears(cameras, points=NO_POINTS):
     return np.array([camera.near for camera in with_near_planes(cameras, points)])
 
 
+def test_with_near_planes__need_a_camera():
+    with pytest.raises(ValueError, match="`cameras` must be at least one"):
+        with_near_planes([], slab())
+
+
 def test_with_near_planes__are_a_fifth_of_the_smallest_depth_or_as_given():
     camera = look_at_cameras([(0, 0, -3)])
     wrong = np.tile([0, 0, -2.99], (4, 1))

@@ -1,5 +1,7 @@
 """Density control in a loop of one's own."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -125,3 +127,15 @@ def test_update_ellipsoids__follows_another_number_of_gaussians_with_gradients()
     assert np.abs(gradient(optimizer["means"])).max() > 0
     with pytest.raises(ValueError, match=r"must have other\.data"):
         morgs_mi.update_ellipsoids(params, gaussians, "other")
+
+
+def test_update_ellipsoids__refuses_gaussians_that_lack_what_the_shape_has():
+    moving = replace(splats(), motion=np.zeros((len(splats()), 3)))
+    scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(moving)})
+    params = mi.traverse(scene)
+    with pytest.raises(ValueError, match="`gaussians` must have `motion`, as the shape has"):
+        morgs_mi.update_ellipsoids(params, splats())
+    with pytest.raises(ValueError, match="at least one"):
+        morgs_mi.update_ellipsoids(params, moving.select(np.zeros(len(moving), bool)))
+    with pytest.raises(ValueError, match="`params` must be"):
+        morgs_mi.update_ellipsoids(scene, moving)

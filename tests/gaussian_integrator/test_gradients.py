@@ -279,3 +279,27 @@ def test_gaussian_splat__gradient_of_the_background(raw):
         (transmitted * weight).sum((0, 1)),
         rtol=tol.GRADIENT_REL,
     )
+
+
+def test_gaussian_splat__tangents_stay_for_further_terms_of_a_loss(raw):
+    """Two images and the parameter itself, with a parameter that depends on another variable."""
+    scene = make_mitsuba_scene(to_gaussians(raw))
+    params = mi.traverse(scene)
+    start = mi.Float(params["gaussians.opacities"])
+    x = mi.Float(0)
+
+    def loss():
+        params["gaussians.opacities"] = start * dr.exp(x)
+        params.update()
+        images = [dr.mean(mi.render(scene, params), axis=None) for _ in range(2)]
+        return images[0].array + images[1].array + dr.mean(params["gaussians.opacities"])
+
+    dr.enable_grad(x)
+    dr.set_grad(x, 1)
+    value = loss()
+    dr.forward_to(value)
+    tangent = dr.grad(value)[0]
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    backward(loss())
+    assert dr.grad(x)[0] == pytest.approx(tangent, rel=tol.DUALITY_REL)

@@ -58,6 +58,13 @@ def test_read_ply__inverts_write_ply_with_all_attributes(tmp_path, degree):
     assert_same(gaussians, copy, rtol=1e-5, atol=1e-6)
 
 
+def test_write_ply__refuses_values_that_are_not_finite(tmp_path):
+    gaussians = replace(to_gaussians(make_unit_scene(0)), means=np.full((10, 3), np.nan))
+    with pytest.raises(ValueError, match="must be finite, got others in `means`"):
+        write_ply(tmp_path / "g.ply", gaussians)
+    assert not (tmp_path / "g.ply").exists()
+
+
 def test_write_ply__stores_the_attributes_of_mitsuba(tmp_path):
     gaussians = to_gaussians(make_unit_scene(1, 2))
     write_ply(tmp_path / "g.ply", gaussians, layout="mitsuba")
@@ -70,9 +77,10 @@ def test_write_ply__stores_the_attributes_of_mitsuba(tmp_path):
 
 
 def test_read_ply__names_an_invalid_motion(tmp_path):
-    raw = make_unit_scene()
-    raw["motion"][3, 1] = np.nan
-    write_ply(tmp_path / "g.ply", to_gaussians(raw), layout="mitsuba")
+    write_ply(tmp_path / "g.ply", to_gaussians(make_unit_scene()), layout="mitsuba")
+    file = PlyData.read(tmp_path / "g.ply", mmap=False)
+    file["vertex"]["motion_1"][3] = np.nan
+    file.write(tmp_path / "g.ply")
     with pytest.raises(ValueError, match=r"others in 1 of 10 Gaussians \(motion of 3\)"):
         read_splats(tmp_path / "g.ply")
 

@@ -51,6 +51,11 @@ def test_copied_images__flag_of_a_bitmap_counts():
     assert_allclose(copied(linear), GREY / 255, atol=1e-6)
 
 
+def test_copied_images__refuses_a_bitmap_of_many_channels():
+    with pytest.raises(ValueError, match=r"must be grey or have colours, got 6 channels"):
+        copied(mi.Bitmap(np.ones((5, 6, 6), np.float32)))
+
+
 def test_copied_images__owns_its_memory():
     for image in (LIGHT.copy(), GREY.copy()):
         result = copied(image)

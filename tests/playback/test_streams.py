@@ -2,13 +2,13 @@
 files.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from plyfile import PlyData
 
 from morgs_mi.codec.frame_source import play
 from morgs_mi.codec.packets import decode, keyframe_packet
@@ -117,9 +117,10 @@ def test_render__names_arguments_that_do_not_fit(tmp_path, run, args, message):
 
 def with_nan(path, rows):
     """Write 40 splats, the first of which have no finite centre."""
-    means = splats().numpy()["means"]
-    means[:rows] = np.nan
-    write_ply(path, replace(splats(), means=means))
+    write_ply(path, splats())
+    file = PlyData.read(path, mmap=False)
+    file["vertex"]["x"][:rows] = np.nan
+    file.write(path)
     return path
 
 

@@ -154,6 +154,20 @@ def test_rasterize__refuses_bad_arguments(scene, arguments, message):
         rasterize(**{"gaussians": to_gaussians(raw), "camera": camera, **arguments})
 
 
+def test_rasterize__background_may_have_any_type_of_numbers(scene):
+    raw, camera = scene
+    gaussians = to_gaussians(raw)
+    expected = rasterize(gaussians, camera, background=(0.5, 0.25, 1)).color
+    exact = mi.Color3d(0.5, 0.25, 1)
+    image = np.full((camera.height, camera.width, 3), [0.5, 0.25, 1], np.float16)
+    dr.enable_grad(exact)
+    for background in (mi.ScalarColor3f(0.5, 0.25, 1), exact, image, mi.TensorXf64(image)):
+        color = rasterize(gaussians, camera, background=background).color
+        assert np.array_equal(color, expected)
+    backward(rasterize(gaussians, camera, background=exact).color)
+    assert dr.grad(exact).x[0] > 0
+
+
 def test_rasterize__refuses_a_pose_that_is_not_finite(scene):
     raw, camera = scene
     viewmat = np.float32(camera.viewmat)

@@ -11,6 +11,7 @@ from morgs_mi import Gaussians, rasterize
 from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.testing import assert_close
 from tests import tolerances as tol
+from tests.scenes.derivatives import backward
 from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import (
     COLOR,
@@ -241,3 +242,32 @@ def test_surfaces__refuse_bad_scenes(shapes, message):
     bad = scene(cloud(), **shapes)
     with pytest.raises(ValueError, match=message):
         bad.integrator().render(bad)
+
+
+def test_surfaces__forward_mode_leaves_the_gaussians_attached():
+    gaussians = cloud(-0.5)
+    ball = {"type": "sphere", "radius": 0.8}
+    light = {"type": "constant", "radiance": 1.0}
+    made = scene(gaussians, {"type": "prb"}, ball=ball, sky=light)
+    params = mi.traverse(made)
+    names = ("gaussians.opacities", "ball.bsdf.reflectance.value")
+    dr.enable_grad([params[name] for name in names])
+    dr.set_grad(params[names[1]], 1)
+    dr.forward_to(mi.render(made, params, spp=4))
+    assert all(dr.grad_enabled(params[name]) for name in names)
+    backward(mi.render(made, params, spp=4))
+    assert np.abs(np.asarray(dr.grad(params[names[0]]))).max() > 0
+
+
+def test_surfaces__before_an_environment_with_gradients_warn_of_nothing(caplog):
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+    ball = {"type": "sphere", "radius": 0.8}
+    made = scene(cloud(-0.5), {"type": "prb"}, ball=ball, sky=sky)
+    params = mi.traverse(made)
+    brightness = mi.Float(1)
+    dr.enable_grad(brightness)
+    params["sky.data"] = params["sky.data"] * brightness
+    params.update()
+    backward(mi.render(made, params, spp=4))
+    assert dr.grad(brightness)[0] > 0
+    assert "silhouettes" not in caplog.text
