@@ -13,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import options
 from morgs_mi.codec.frame_source import FrameSource
+from morgs_mi.platform.checks import check_number
 from morgs_mi.platform.progress import Report
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.formats import Format, destination
@@ -128,7 +129,10 @@ def shown_exposure(stream: FrameSource, stops: float | None) -> float:
     """
     from morgs_mi.playback.stream_header import stream_exposure
 
-    return stream_exposure(stream) if stops is None else stops
+    if stops is None:
+        return stream_exposure(stream)
+    check_number("images", "display_exposure", stops, "[-100, 100]")
+    return stops
 
 
 def relative_to(stream: FrameSource) -> str:

@@ -82,7 +82,7 @@ def regular(path: str | Path) -> Path:
     """
     path = Path(path)
     is_other = path.exists() and not path.is_file()
-    require(not is_other, path, "expected a file", "a folder, a pipe or a device", "remove it")
+    require(not is_other, path, "expected a file", "a folder, a pipe or a device", "name a file")
     return path
 
 

@@ -157,7 +157,7 @@ def open_stream(
     problems = []
     if stream.skipped:
         problems.append(f"the damaged frames {few(stream.skipped)} are skipped")
-    if skip_damaged and not stream.closed():
+    if not stream.closed():
         problems.append(
             f"it ends after {quantity(len(stream.index()), 'packet')} without an index, and may "
             "lack later frames"

@@ -161,7 +161,7 @@ def _detached(shapes: list[mi.Shape]) -> Iterator[None]:
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
-    tables = [(shape, mi.traverse(shape)) for shape in shapes]
+    tables: list[tuple[mi.Shape, Any]] = [(shape, mi.traverse(shape)) for shape in shapes]
     # Copies: a parameter is a reference to the shape's value.
     attached = [
         (params, key, type(params[key])(params[key]))

@@ -83,7 +83,7 @@ POSES_BOUNDS = {
     ),
     "pipe beside": (
         pipe("capture.json"),
-        "capture.json: expected a file, got a folder, a pipe or a device; remove it",
+        "capture.json: expected a file, got a folder, a pipe or a device; name a file",
     ),
     "far offset": (
         lambda path: None,

@@ -42,7 +42,7 @@ def test_main__ends_silently_if_the_reader_of_its_output_has():
         (["fit", "a", "b", "--segments", "2"], ("--segments is now --chunks.",)),
         (
             ["fit", "a", "b", "--reproducible"],
-            ("every fit on a CPU is reproducible",),
+            ("fits without a limit of the clock are",),
         ),
         (["fit", "a", "b", "--key_views", "4"], ("`key_views` in `[motion]`",)),
     ],

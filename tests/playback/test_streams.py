@@ -107,6 +107,10 @@ def test_render__draws_a_thumbnail_for_each_camera(tmp_path, run):
             "a.png: expected one image for one file, got 150; name a folder",
         ),
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
+        (
+            ("a.png", "--camera", "front", "--display-exposure", "nan"),
+            "`display_exposure` must be a number in [-100, 100], got nan",
+        ),
     ],
 )
 def test_render__names_arguments_that_do_not_fit(tmp_path, run, args, message):

@@ -131,7 +131,7 @@ class Info:
 
 def _print_stream(path: Path) -> None:
     """Print what a stream, or a file of Gaussians, has in its first frame."""
-    stream = opened(path, drop_invalid=False)
+    stream = opened(path, drop_invalid=False, skip_damaged=True)
     frames = len(stream.frame_numbers())
     gaussians = next(stream.states()).gaussians
     print_result(

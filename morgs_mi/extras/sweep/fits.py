@@ -17,6 +17,7 @@ from urllib.parse import quote
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.results import ViewScores
@@ -118,6 +119,7 @@ def fit_arms(
         ValueError: as `stream_capture`, or the network is missing or another one.
         OSError: as `stream_capture`.
     """
+    check_output(out)
     folder = _FitsFolder(capture, out, measure)
     fits = Fits.of(len(arms), seeds)
     total = seeds * len(arms)

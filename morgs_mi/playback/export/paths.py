@@ -52,11 +52,12 @@ class CameraPath:
         times = np.asarray(self.times, np.float64)
         object.__setattr__(self, "times", times)
         sizes = {key.size for key in self.keys}
-        are_times = (
-            times.shape == (len(self.keys),) and times[0] == 0 and np.all(np.diff(times) > 0)
-        )
         require(
-            len(self.keys) > 1 and len(sizes) == 1 and are_times,
+            times.shape == (len(self.keys),)
+            and len(self.keys) > 1
+            and len(sizes) == 1
+            and times[0] == 0
+            and np.all(np.diff(times) > 0),
             "CameraPath()",
             "expected at least two key views of one size, with `times` that increase from 0",
             f"{len(self.keys)} views of {sorted(sizes)} at {times.tolist()}",

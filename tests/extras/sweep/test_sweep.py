@@ -36,6 +36,14 @@ __all__ = ["run"]
 QUICK = quick(density=NO_DENSITY)
 
 
+def test_sweep__writes_nothing_into_a_capture(tmp_path):
+    capture = load_capture(write_recording(tmp_path / "clip"))
+    content = {*(tmp_path / "clip").rglob("*")}
+    with pytest.raises(ValueError, match="expected an output outside of captures"):
+        sweep(capture, out=tmp_path / "clip" / "results", seeds=1)
+    assert {*(tmp_path / "clip").rglob("*")} == content
+
+
 @pytest.mark.slow
 def test_sweep__arms_continue_one_first_frame_and_are_not_fitted_again(tmp_path, monkeypatch):
     capture = load_capture(write_recording(tmp_path / "clip", 3), test_view=0)

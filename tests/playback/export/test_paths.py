@@ -107,6 +107,7 @@ def test_load_path__reads_matrices_sizes_and_angles(tmp_path):
             "a list `keys` of views, got [{'id': 0, 'img_name': 'a'}] (TypeError",
         ),
         (f'{{"keys": [{{"time": 0, "viewmat": {VIEWMAT}}}]}}', "two key views of one size"),
+        ('{"keys": []}', "two key views of one size"),
         (f'{{"keys": [{{"viewmat": {VIEWMAT}}}]}}', "key 0: expected a JSON object"),
         (
             '{"keys": [{"time": 0, "camera": "left"}]}',
