@@ -124,7 +124,7 @@ def fit_gaussians(
     config = config_or_default("fit_gaussians()", config, StreamConfig())
     if background is not None:
         behind = np.asarray(background)
-        if behind.size == 3:
+        if behind.ndim < 2 or behind.size == 3:
             render = replace(config.render, background=tuple(behind.ravel().tolist()))
             config = replace(config, render=render)
         else:

@@ -123,7 +123,7 @@ def test_fit_gaussians__equals_the_loop_over_a_colour_and_over_images():
     ]
     results = []
     for background, views, settings in (
-        ((1.0, 1.0, 1.0), cameras, over_white),
+        (mi.Color3f(1), cameras, over_white),
         (behind, over_images, config),
     ):
         loop = StreamLoop(views, *cloud, settings)
