@@ -117,7 +117,7 @@ def update_ellipsoids(params: Any, gaussians: ActivatedGaussians, shape: str = "
             place,
             f"`gaussians` must have `{name}`, as the shape has",
             "none",
-            "load the scene anew, or give them one",
+            "set it, or load the scene again with a shape that has none",
         )
     quats: Any = gaussians.quats
     length = dr.maximum(dr.sum(dr.square(quats), axis=1), 1e-30)

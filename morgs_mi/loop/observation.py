@@ -132,8 +132,8 @@ def prepare(
         setup_views.append(View(view.camera, mask=mask))
     if not any(view.mask is None or view.mask.any() for view in setup_views):
         raise ValueError(
-            "StreamLoop(): the masks of `views` must have a valid pixel, got none in any view; "
-            "true pixels are used."
+            "StreamLoop(): the masks of `views` must have a valid pixel, got none in any view; set "
+            "the pixels to use to True."
         )
     setup_views = Views(setup_views)
     cameras = setup_views.cameras

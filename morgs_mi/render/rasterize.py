@@ -23,12 +23,7 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.background import backdrops, over
 from morgs_mi.render.blocks import BlockLists, build_lists, touches
-from morgs_mi.render.channels import (
-    NORMALISED,
-    attribute_channels,
-    channel_sizes,
-    required_attributes,
-)
+from morgs_mi.render.channels import NORMALISED, channel_sizes, required_attributes
 from morgs_mi.render.compositing import Layout, blend
 from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.loops import Channel
@@ -580,8 +575,8 @@ def _check_finite(
     count: Any = dr.count(~finite)  # in fewer launches than `dr.all`
     if not count[0]:
         return
-    others = [attribute.activated_name for attribute in attribute_channels().values()]
-    blended_names = ("sh_coeffs", "motion", *others)
+    attributes = [row.activated_name for row in required_attributes().values() if row is not None]
+    blended_names = ("sh_coeffs", *attributes)
     names = ("means", "scales", "quats", "opacities", *blended_names)
     values = [
         *(("camera.viewmat", camera.viewmat) for camera in cameras),

@@ -24,7 +24,7 @@ from morgs_mi.render.rasterize import rasterize
 from morgs_mi.testing import assert_close
 from tests.cli.commands import assert_refused
 from tests.cli.conftest import run
-from tests.scenes.changing_splats import splats
+from tests.scenes.changing_splats import splats, write_stream
 
 __all__ = ["run"]
 
@@ -117,6 +117,29 @@ def test_render__names_arguments_that_do_not_fit(tmp_path, run, args, message):
     write_ply(tmp_path / "scene.ply", splats())
     assert_refused(run("render", tmp_path / "scene.ply", *args), message)
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_info__names_damaged_frames_and_refuses_the_options_of_captures(tmp_path, run, caplog):
+    path = tmp_path / "a.morgs"
+    write_stream(path, keyframe_interval=2)
+    assert run("info", path)[0] == 0
+    assert not caplog.messages
+    refused = run("info", path, "--plot", tmp_path / "a.png")
+    assert_refused(refused, "expected a capture, which the options of info are for, got a stream")
+    _, _, offset = StreamReader(path).index()[1]
+    data = bytearray(path.read_bytes())
+    data[offset + 40] ^= 1
+    path.write_bytes(data)
+    assert run("info", path)[0] == 0
+    assert "the damaged frames 1 are skipped" in caplog.text
+
+
+def test_open_stream__warns_of_a_stream_without_an_index(tmp_path, caplog):
+    path = tmp_path / "a.morgs"
+    write_stream(path)
+    path.write_bytes(path.read_bytes()[:-5])
+    open_stream(path)
+    assert "without an index, and may lack later frames" in caplog.text
 
 
 def with_nan(path, rows):

@@ -36,7 +36,7 @@ from morgs_mi.extras.calibration.checks.plots import write_rig
 from morgs_mi.extras.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.extras.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.platform.checks import quantity
+from morgs_mi.platform.checks import quantity, require
 from morgs_mi.platform.files import STREAM
 from morgs_mi.platform.plots import check_plot
 from morgs_mi.playback.streams import SplatFile
@@ -85,6 +85,13 @@ class Info:
             check_plot(self.plot)
         fits = [self.capture / STREAM, *self.capture.glob(f"*/{STREAM}")]
         if self.capture.is_file() or any(fit.is_file() for fit in fits):
+            require(
+                self == Info(self.capture),
+                self.capture,
+                "expected a capture, which the options of info are for",
+                "a stream",
+                "leave them out",
+            )
             _print_stream(self.capture)
             return
         capture = load_capture(self.capture, reading=self.reading.read_config())

@@ -1,4 +1,4 @@
-"""Who gets what from the viewer: other pages, hosts and machines, files and broken requests."""
+"""Access to the viewer: by other pages, hosts and machines, to files, and by broken requests."""
 
 import os
 import re
